@@ -1,0 +1,1 @@
+"""Area packs: DOP and DSM from disk to arrays on a `RasterGrid`."""
