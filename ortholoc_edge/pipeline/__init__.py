@@ -1,0 +1,1 @@
+"""What happens to one frame: prior, region, precondition, match, lift, pose, AdHoP, gate. No threads, no sockets."""

@@ -1,0 +1,47 @@
+"""A camera frame and what the vehicle knew of itself when it was exposed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One picture.
+
+    Attributes:
+        stamp_ns: middle of the exposure, monotonic clock.
+        image: (H, W) grey or (H, W, 3) RGB, uint8.
+        name: file name or running number, for logs and results.
+    """
+
+    stamp_ns: int
+    image: ImageArray
+    name: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VehicleState:
+    """The autopilot's view of the vehicle at ``stamp_ns`` (in replay: a simulated autopilot's).
+
+    Attributes:
+        stamp_ns: monotonic clock; the exposure the values were interpolated to.
+        ned_from_body: (3, 3), true north; None where the autopilot sent no usable attitude.
+        attitude_sigma_rad: 1-sigma of roll, pitch, yaw.
+        odometry_ned_m: (3,) dead-reckoned position, m, true north, from an origin of its own; only differences
+            within one ``odometry_epoch`` mean anything. None without odometry.
+        odometry_epoch: rises when the odometry jumped or was restarted.
+        position_map_m: (3,) easting, northing, height from an absolute source that is trusted now (GNSS before
+            it was lost); None otherwise.
+        position_sigma_m: 1-sigma of that position, horizontal (per axis) and vertical.
+    """
+
+    stamp_ns: int
+    ned_from_body: FloatArray | None
+    attitude_sigma_rad: tuple[float, float, float]
+    odometry_ned_m: FloatArray | None = None
+    odometry_epoch: int = 0
+    position_map_m: FloatArray | None = None
+    position_sigma_m: tuple[float, float] = (0.0, 0.0)

@@ -1,0 +1,77 @@
+"""What one frame comes to: a fix, or a rejection with its reason. Both are ordinary values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from ortholoc_edge.geometry.arrays import FloatArray
+from ortholoc_edge.geometry.rigid import Rigid3
+
+
+class Reason(StrEnum):
+    """Why a frame gave no fix."""
+
+    BAD_FRAME = "bad_frame"  # truncated, empty, or of another size than the camera's
+    NO_PRIOR = "no_prior"  # nothing says where to look
+    BAD_ATTITUDE = "bad_attitude"  # NaN or missing attitude from the autopilot
+    PRIOR_TOO_WIDE = "prior_too_wide"  # the search would cover more map than may be read
+    OUTSIDE_MAP = "outside_map"  # the predicted view does not meet the pack
+    MAP_NODATA = "map_nodata"  # the pack has no DOP or no DSM there
+    MAP_DAMAGED = "map_damaged"  # a tile of the pack can't be decoded
+    FEW_MATCHES = "few_matches"
+    FEW_INLIERS = "few_inliers"
+    LOW_INLIER_RATIO = "low_inlier_ratio"
+    POOR_SPREAD = "poor_spread"  # inliers huddle in a part of the image
+    HIGH_REPROJECTION = "high_reprojection"
+    DEGENERATE_GEOMETRY = "degenerate_geometry"  # the pose is not determined by the matches
+    GRAVITY_DISAGREES = "gravity_disagrees"  # the horizon differs from the autopilot's
+    PRIOR_DISAGREES = "prior_disagrees"  # heading or position too far from what was predicted
+    UNCERTAIN = "uncertain"  # the pose's own covariance is too wide
+    LATE = "late"
+    INTERNAL = "internal"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rejected:
+    """No fix. ``measured`` against ``limit`` (where the test is a number) tells by how much."""
+
+    stamp_ns: int
+    reason: Reason
+    detail: str = ""
+    measured: float | None = None
+    limit: float | None = None
+    timings_ms: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fix:
+    """A pose that passed the gate.
+
+    Attributes:
+        stamp_ns: of the frame.
+        map_from_camera: easting, northing, height in m (map units, not true metres) and grid-north axes.
+        covariance: (6, 6); position in map axes (m), then rotation vector in map axes (rad):
+            ``R_true = exp(d) @ R_estimated``.
+        quality: 0..1, the inlier ratio weighed by their spread; for displays and for MAVLink's quality field.
+        matches, inliers: counts of the round that gave the pose.
+        rms_px: robust reprojection error of the inliers at the frame's full size.
+        adhop_accepted: whether the second round gave the pose; None if it was not run.
+        query_px, points_map: (M, 2) and (M, 3), the inliers.
+        timings_ms: per stage.
+    """
+
+    stamp_ns: int
+    map_from_camera: Rigid3
+    covariance: FloatArray
+    quality: float
+    matches: int
+    inliers: int
+    rms_px: float
+    adhop_accepted: bool | None
+    query_px: FloatArray
+    points_map: FloatArray
+    timings_ms: dict[str, float] = field(default_factory=dict)
+
+
+Outcome = Fix | Rejected
