@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 from ortholoc_edge.geometry.arrays import FloatArray
+from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.rigid import Rigid3
 
 
@@ -51,6 +52,8 @@ class Fix:
     Attributes:
         stamp_ns: of the frame.
         map_from_camera: easting, northing, height in m (map units, not true metres) and grid-north axes.
+        camera: the intrinsics of the pose: the configured ones, or calibrated.
+        focal_sigma_px: 1-sigma of a calibrated focal length; None if it was given.
         covariance: (6, 6); position in map axes (m), then rotation vector in map axes (rad):
             ``R_true = exp(d) @ R_estimated``.
         quality: 0..1, the inlier ratio weighed by their spread; for displays and for MAVLink's quality field.
@@ -63,6 +66,7 @@ class Fix:
 
     stamp_ns: int
     map_from_camera: Rigid3
+    camera: Camera
     covariance: FloatArray
     quality: float
     matches: int
@@ -71,6 +75,7 @@ class Fix:
     adhop_accepted: bool | None
     query_px: FloatArray
     points_map: FloatArray
+    focal_sigma_px: float | None = None
     timings_ms: dict[str, float] = field(default_factory=dict)
 
 

@@ -1,0 +1,1 @@
+"""Recorded sequences, truth, metrics and reports."""

@@ -1,0 +1,159 @@
+"""Results on disk and on the screen."""
+
+from __future__ import annotations
+
+import resource
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from ortholoc_edge.bench import draw
+from ortholoc_edge.bench.metrics import Spread, Summary
+from ortholoc_edge.bench.replay import FrameResult
+from ortholoc_edge.errors import OrtholocError
+from ortholoc_edge.geometry import rotation
+from ortholoc_edge.pipeline.outcome import Fix, Outcome
+from ortholoc_edge.tiles.store import MapStore
+
+
+def outcome_record(outcome: Outcome) -> dict[str, Any]:
+    """An outcome as plain values, for JSON."""
+    if not isinstance(outcome, Fix):
+        return {
+            "fix": False,
+            "reason": str(outcome.reason),
+            "detail": outcome.detail,
+            "measured": outcome.measured,
+            "limit": outcome.limit,
+            "timings_ms": outcome.timings_ms,
+        }
+    pose = outcome.map_from_camera
+    return {
+        "fix": True,
+        "position_map_m": pose.translation.tolist(),
+        "quaternion_map_from_camera_wxyz": rotation.to_quaternion(pose.rotation).tolist(),
+        "covariance": outcome.covariance.tolist(),
+        "quality": outcome.quality,
+        "matches": outcome.matches,
+        "inliers": outcome.inliers,
+        "rms_px": outcome.rms_px,
+        "adhop_accepted": outcome.adhop_accepted,
+        "focal_px": outcome.camera.focal_px,
+        "focal_sigma_px": outcome.focal_sigma_px,
+        "timings_ms": outcome.timings_ms,
+    }
+
+
+def frame_record(result: FrameResult) -> dict[str, Any]:
+    """One line of ``frames.jsonl``."""
+    return {
+        "name": result.name,
+        "stamp_ns": result.stamp_ns,
+        **outcome_record(result.outcome),
+        "te_m": result.error and result.error.te_m,
+        "re_deg": result.error and result.error.re_deg,
+        "nees": result.error and result.error.nees,
+        "true_position_map_m": result.truth.translation.tolist(),
+        "prior_position_map_m": None if result.prior is None else result.prior.map_from_camera.translation.tolist(),
+        "prior_error_m": None
+        if result.prior is None
+        else float(np.linalg.norm(result.prior.map_from_camera.translation - result.truth.translation)),
+        "cpu_ms": result.cpu_ms,
+    }
+
+
+class FrameWriter:
+    """Per-frame results under a folder: ``frames.jsonl`` and ``overlays/NAME.png``, written as they come."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        try:
+            (folder / "overlays").mkdir(parents=True, exist_ok=True)
+            self._lines = (folder / "frames.jsonl").open("wb")
+        except OSError as err:
+            raise OrtholocError(f"{folder}: can't write results there ({err}); choose another --out") from err
+
+    def write(self, result: FrameResult) -> None:
+        try:
+            self._lines.write(msgspec.json.encode(frame_record(result)) + b"\n")
+            self._lines.flush()
+        except OSError as err:
+            raise OrtholocError(f"{self._folder}: can't write results ({err})") from err
+        if result.image is not None:
+            picture = draw.overlay(
+                result.image, result.outcome, result.truth, result.camera, frame_caption(result)
+            )
+            draw.write_png(self._folder / "overlays" / f"{result.name}.png", picture)
+
+    def close(self) -> None:
+        self._lines.close()
+
+
+def frame_caption(result: FrameResult) -> str:
+    outcome, error = result.outcome, result.error
+    if isinstance(outcome, Fix) and error is not None:
+        return (
+            f"{result.name}  TE {error.te_m:.2f} m  RE {error.re_deg:.2f} deg  {outcome.inliers}/{outcome.matches} "
+            f"inliers  truth green, estimate red"
+        )
+    return f"{result.name}  no fix: {getattr(outcome, 'reason', '')}"
+
+
+def track_picture(store: MapStore, results: list[FrameResult], caption: str) -> np.ndarray:
+    """Truth, predictions, fixes and frames without one, over the orthophoto."""
+    truth = np.array([r.truth.translation[:2] for r in results])
+    priors = [r.prior.map_from_camera.translation[:2] for r in results if r.prior is not None]
+    fixes = [r.outcome.map_from_camera.translation[:2] for r in results if isinstance(r.outcome, Fix)]
+    missed = [r.truth.translation[:2] for r in results if not isinstance(r.outcome, Fix)]
+    return draw.track(
+        store,
+        [
+            draw.Track("truth", truth, draw.TRUTH),
+            draw.Track("predicted", np.reshape(priors, (-1, 2)), draw.PRIOR, joined=False),
+            draw.Track("fix", np.reshape(fixes, (-1, 2)), draw.ESTIMATE, joined=False),
+            draw.Track("no fix (true place)", np.reshape(missed, (-1, 2)), (255, 255, 255), joined=False),
+        ],
+        caption,
+    )
+
+
+def rss_mb() -> float:
+    """Peak resident memory of this process, MiB (Linux counts in KiB)."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+def table(summary: Summary) -> str:
+    """The summary for people."""
+
+    def spread(s: Spread, unit: str) -> str:
+        if s.median is None or s.p90 is None or s.p99 is None or s.max is None:
+            return "-"
+        return f"median {s.median:.3f}  p90 {s.p90:.3f}  p99 {s.p99:.3f}  max {s.max:.3f} {unit}"
+
+    rows = [
+        ("sequence", f"{summary.sequence} on {summary.pack}"),
+        ("matcher", f"{summary.matcher}, AdHoP {'on' if summary.adhop else 'off'}, prior {summary.prior}, "
+                    f"seed {summary.seed}"),
+        ("model", summary.model_sha256 or "none (no weights)"),
+        ("frames", f"{summary.frames}, of which fixes {summary.fixes} "
+                   f"(AdHoP gave the pose of {summary.adhop_accepted})"),
+        ("rejected", ", ".join(f"{reason} {count}" for reason, count in summary.rejected.items()) or "none"),
+        ("recall", "  ".join(f"{name.replace('_', '-')} {100 * part:.1f} %" for name, part in summary.recall.items())),
+        ("position error", spread(summary.te_m, "m")),
+        ("rotation error", spread(summary.re_deg, "deg")),
+        ("false fixes", str(summary.false_fixes)),
+        ("NEES", "-" if summary.nees.mean is None or summary.nees.p95 is None
+         else f"mean {summary.nees.mean:.1f}  p95 {summary.nees.p95:.1f}  (honest: mean {summary.nees.dof})"),
+    ]
+    rows += [
+        (f"latency {stage}", f"median {l.median:.0f}  p95 {l.p95:.0f}  p99 {l.p99:.0f} ms")
+        for stage, l in summary.latency_ms.items()
+    ]
+    rows += [
+        ("CPU per frame", f"{summary.cpu_ms_per_frame:.0f} ms"),
+        ("peak memory", f"{summary.rss_mb:.0f} MiB"),
+    ]
+    width = max(len(name) for name, _ in rows)
+    return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)

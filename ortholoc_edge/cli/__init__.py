@@ -1,0 +1,60 @@
+"""The command line. One module per subcommand; only here are log handlers installed."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import sys
+from collections.abc import Sequence
+
+from ortholoc_edge import __version__
+from ortholoc_edge.errors import ConfigError, OrtholocError
+
+EXIT_FAILED = 1
+EXIT_CONFIG = 78  # EX_CONFIG: systemd's RestartPreventExitStatus, a restart can't mend a typo
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point of ``ortholoc-edge``. Returns the exit code."""
+    # OpenBLAS threads fight the pipeline's own for two cores; nearest-neighbour search took four times the
+    # CPU with them (matchers.md). It reads this once, when numpy is first imported.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    parser = _parser()
+    args = parser.parse_args(argv)
+    logging.basicConfig(
+        stream=sys.stderr,
+        level=logging.DEBUG if args.verbose else logging.INFO,
+        format="%(levelname)s %(name)s: %(message)s",
+    )
+    try:
+        return int(args.run(args))
+    except ConfigError as error:
+        print(f"ortholoc-edge: {error}", file=sys.stderr)
+        return EXIT_CONFIG
+    except OrtholocError as error:
+        print(f"ortholoc-edge: {error}", file=sys.stderr)
+        return EXIT_FAILED
+    except KeyboardInterrupt:
+        print("ortholoc-edge: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        # The reader of our output went away (`| head`); nothing is wrong here.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    # After OPENBLAS_NUM_THREADS is set: these import numpy.
+    from ortholoc_edge.cli import localize, models, replay, run, sim, tiles
+
+    parser = argparse.ArgumentParser(
+        prog="ortholoc-edge",
+        description="Tells a drone without GNSS where it is, from its camera, an orthophoto and a surface model.",
+    )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    parser.add_argument("-v", "--verbose", action="store_true", help="log debugging details to stderr")
+    subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for module in (sim, run, replay, localize, tiles, models):
+        module.add_parser(subparsers)
+    return parser

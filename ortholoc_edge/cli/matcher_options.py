@@ -1,0 +1,35 @@
+"""Options that every command with a matcher shares."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ortholoc_edge.cli.progress import ProgressBar
+from ortholoc_edge.matching.registry import MATCHERS, make_matcher
+from ortholoc_edge.matching.types import Matcher
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("matching")
+    group.add_argument("--matcher", choices=MATCHERS, default="xfeat", help="default: %(default)s")
+    group.add_argument(
+        "--working-px", type=int, default=640, help="long side at which images are matched, px (default: %(default)s)"
+    )
+    group.add_argument("--threads", type=int, default=1, help="threads of one inference (default: %(default)s)")
+    group.add_argument("--model", type=Path, metavar="FILE", help="an ONNX file instead of the built model")
+    group.add_argument("--model-sha256", metavar="HASH", help="refuse --model unless it has this SHA-256")
+    group.add_argument("--no-adhop", action="store_true", help="one matching round only")
+
+
+def matcher(args: argparse.Namespace) -> Matcher:
+    """The matcher that the arguments name; its model is built first where that was never done."""
+    with ProgressBar(f"model {args.matcher}") as bar:
+        return make_matcher(
+            args.matcher,
+            working_px=args.working_px,
+            threads=args.threads,
+            model_path=args.model,
+            model_sha256=args.model_sha256,
+            progress=bar.step,
+        )

@@ -1,0 +1,154 @@
+"""Reasons to refuse a pose, one function each: no fix is better than a wrong fix.
+
+Each test returns None, or a `Refusal` that says what was measured against which limit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import cv2
+import numpy as np
+from msgspec import Meta, Struct
+
+from ortholoc_edge.geometry import rotation
+from ortholoc_edge.geometry.arrays import FloatArray
+from ortholoc_edge.geometry.covariance import mahalanobis_squared
+from ortholoc_edge.geometry.rigid import Rigid3
+from ortholoc_edge.pipeline.outcome import Reason
+from ortholoc_edge.pipeline.prior import PosePrior
+from ortholoc_edge.pose.pnp import PoseEstimate
+
+
+class GateOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Limits of the gate. Lower ones give more fixes and, in the end, a wrong one."""
+
+    min_inliers: Annotated[int, Meta(ge=6)] = 20
+    min_inlier_ratio: Annotated[float, Meta(ge=0, le=1)] = 0.10
+    # Convex hull of the inliers over the image's area.
+    min_spread: Annotated[float, Meta(ge=0, le=1)] = 0.10
+    # Root mean square of the inliers over the inlier threshold; uniform outliers give 0.71.
+    max_rms_ratio: Annotated[float, Meta(gt=0, le=1)] = 0.65
+    # Of tilt, heading and position against the prior, in sigmas of the difference.
+    max_innovation_sigmas: Annotated[float, Meta(gt=0)] = 5.0
+    # Position uncertainty over height above ground.
+    max_relative_sigma: Annotated[float, Meta(gt=0)] = 0.10
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Why, and by how much."""
+
+    reason: Reason
+    detail: str
+    measured: float
+    limit: float
+
+
+def check(
+    estimate: PoseEstimate,
+    query_px: FloatArray,
+    map_from_camera: Rigid3,
+    covariance: FloatArray,
+    height_above_ground_m: float,
+    prior: PosePrior | None,
+    max_error_px: float,
+    options: GateOptions,
+) -> Refusal | None:
+    """The first test that a pose fails, in the order of what it costs to be wrong about it.
+
+    Args:
+        estimate: of the solver; ``query_px`` (N, 2) are the matches it was given.
+        map_from_camera, covariance: the same pose in map coordinates, (6, 6) with the map's own error.
+        height_above_ground_m: of the estimated camera.
+        prior: None where none was used.
+    """
+    return (
+        enough_inliers(estimate, options)
+        or well_spread(estimate, query_px, options)
+        or small_residual(estimate, max_error_px, options)
+        or above_ground(height_above_ground_m)
+        or certain(covariance, height_above_ground_m, options)
+        or (prior and agrees_with(prior, map_from_camera, covariance, options))
+        or None
+    )
+
+
+def enough_inliers(estimate: PoseEstimate, options: GateOptions) -> Refusal | None:
+    """Chance alone gives a handful of inliers to any pose of enough random matches."""
+    count, total = int(np.count_nonzero(estimate.inliers)), len(estimate.inliers)
+    if count < options.min_inliers:
+        return Refusal(Reason.FEW_INLIERS, f"{count} of {total} matches", count, options.min_inliers)
+    ratio = count / total
+    if ratio < options.min_inlier_ratio:
+        return Refusal(
+            Reason.LOW_INLIER_RATIO, f"{count} of {total} matches", ratio, options.min_inlier_ratio
+        )
+    return None
+
+
+def well_spread(estimate: PoseEstimate, query_px: FloatArray, options: GateOptions) -> Refusal | None:
+    """Inliers in one corner fix the pose there and let it swing elsewhere."""
+    hull = cv2.convexHull(query_px[estimate.inliers].astype(np.float32))
+    spread = float(cv2.contourArea(hull)) / (estimate.camera.width * estimate.camera.height)
+    if spread < options.min_spread:
+        return Refusal(Reason.POOR_SPREAD, "inliers over the image's area", spread, options.min_spread)
+    return None
+
+
+def small_residual(estimate: PoseEstimate, max_error_px: float, options: GateOptions) -> Refusal | None:
+    """Wrong inliers fill the threshold evenly; right ones huddle at its centre."""
+    limit = options.max_rms_ratio * max_error_px
+    if estimate.rms_px > limit:
+        return Refusal(Reason.HIGH_REPROJECTION, "root mean square, px", estimate.rms_px, limit)
+    return None
+
+
+def above_ground(height_above_ground_m: float) -> Refusal | None:
+    """A flat scene has a mirror solution below the ground."""
+    if not height_above_ground_m > 0:
+        return Refusal(
+            Reason.DEGENERATE_GEOMETRY, "camera below the surface, m", height_above_ground_m, 0.0
+        )
+    return None
+
+
+def certain(covariance: FloatArray, height_above_ground_m: float, options: GateOptions) -> Refusal | None:
+    """A pose that says of itself that it may be anywhere is no help to a filter."""
+    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+    limit = options.max_relative_sigma * height_above_ground_m
+    if sigma > limit:
+        return Refusal(Reason.UNCERTAIN, "1-sigma of position along its worst axis, m", sigma, limit)
+    return None
+
+
+def agrees_with(
+    prior: PosePrior, map_from_camera: Rigid3, covariance: FloatArray, options: GateOptions
+) -> Refusal | None:
+    """Tilt against gravity, then heading, then position against what was predicted."""
+    limit = options.max_innovation_sigmas
+    turn = rotation.log(map_from_camera.rotation @ prior.map_from_camera.rotation.T)
+    spread = prior.covariance + covariance
+    tilt = float(np.sqrt(mahalanobis_squared(turn[:2], spread[3:5, 3:5])))
+    if tilt > limit:
+        degrees = float(np.degrees(np.linalg.norm(turn[:2])))
+        return Refusal(
+            Reason.GRAVITY_DISAGREES, f"{degrees:.1f} deg from the autopilot's, in sigmas", tilt, limit
+        )
+    heading = abs(float(turn[2])) / float(np.sqrt(spread[5, 5]))
+    if heading > limit:
+        degrees = float(np.degrees(abs(turn[2])))
+        return Refusal(
+            Reason.PRIOR_DISAGREES, f"heading {degrees:.1f} deg off, in sigmas", heading, limit
+        )
+    step = map_from_camera.translation - prior.map_from_camera.translation
+    moved = float(np.sqrt(mahalanobis_squared(step, spread[:3, :3])))
+    if moved > limit:
+        return Refusal(
+            Reason.PRIOR_DISAGREES,
+            f"position {float(np.linalg.norm(step)):.1f} m off, in sigmas",
+            moved,
+            limit,
+        )
+    return None

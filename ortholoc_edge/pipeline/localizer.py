@@ -1,0 +1,444 @@
+"""One frame and where to look for it, to a fix or a rejection. Holds no state from frame to frame."""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import cv2
+import numpy as np
+from msgspec import Meta, Struct, field
+
+from ortholoc_edge.errors import MapError
+from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
+from ortholoc_edge.geometry.camera import Camera
+from ortholoc_edge.geometry.grid import resize_px
+from ortholoc_edge.geometry.rigid import Rigid3
+from ortholoc_edge.matching.adhop import fit_homography
+from ortholoc_edge.matching.types import Features, Matcher, Matches
+from ortholoc_edge.pipeline import gate, precondition
+from ortholoc_edge.pipeline.frame import Frame
+from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
+from ortholoc_edge.pipeline.precondition import ReferenceView
+from ortholoc_edge.pipeline.prior import (
+    MAX_RANGE_HEIGHTS,
+    Bounds,
+    PosePrior,
+    RegionPrior,
+    footprint,
+    search_bounds,
+)
+from ortholoc_edge.pipeline.trace import Trace
+from ortholoc_edge.pose import calibrate, pnp
+from ortholoc_edge.pose.lift import lift
+from ortholoc_edge.tiles.georeference import LocalFrame
+from ortholoc_edge.tiles.manifest import Manifest
+from ortholoc_edge.tiles.store import MapStore
+from ortholoc_edge.tiles.window import MapWindow
+
+# Paper, "Initial Camera Calibration / Localization": matches below are dropped, where the matcher has one.
+MIN_CONFIDENCE = 0.5
+_MIN_MATCHES = 12
+# XFeat bears about 30 degrees of turn (matchers.md, "Rotation"); this covers twice the sigma in such steps.
+_HEADING_STEP_RAD = math.radians(30.0)
+_MAX_HEADING_STEPS = 6
+# A map picture finer than the frame is no use; a coarser one than this is hard to match (field-notes, scale).
+_MAX_COARSENING = 3.0
+_UNSTATED_SIGMA_PX = 0.5
+# Half sides of the squares around the predicted position in which the ground's height is looked up.
+_GROUND_REACH_M = (20.0, 80.0, 320.0)
+
+
+class LocalizerOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How a frame is localized.
+
+    ``adhop``: match a second time in the orthophoto warped by the first matches' homography.
+    ``search_sigmas``: how far around the predicted footprint the map is read.
+    ``max_window_mpx``: limit of that part of the map, in million DOP pixels.
+    ``homography_threshold_px``: of AdHoP's RANSAC, at 1024 px; ground is not flat, so it is wider than PnP's.
+    ``calibrate``: solve for the focal length too.
+    """
+
+    adhop: bool = True
+    search_sigmas: Annotated[float, Meta(gt=0, le=10)] = 2.5
+    max_window_mpx: Annotated[float, Meta(gt=0, le=64)] = 6.0
+    homography_threshold_px: Annotated[float, Meta(gt=0)] = 10.0
+    calibrate: bool = False
+    gate: gate.GateOptions = field(default_factory=gate.GateOptions)
+
+
+class _RejectedError(Exception):
+    """Carries a rejection out of a stage to `Localizer.localize`, its only catcher."""
+
+    def __init__(
+        self, reason: Reason, detail: str, measured: float | None = None, limit: float | None = None
+    ) -> None:
+        super().__init__(detail)
+        self.reason, self.detail, self.measured, self.limit = reason, detail, measured, limit
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Round:
+    """One matching round.
+
+    Attributes:
+        matches: frame pixels (undistorted) and DOP pixels, filtered.
+        kept: indices of the matches that have a height.
+        points_map: (M, 3) their points.
+        estimate: the pose in the local frame, or None.
+        mean_error_px: of all M under that pose, each cut at the image's diagonal; infinite without a pose.
+    """
+
+    matches: Matches
+    kept: np.ndarray
+    points_map: FloatArray
+    estimate: pnp.PoseEstimate | None
+    mean_error_px: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scene:
+    """The part of the map to look at.
+
+    Attributes:
+        window, dop_grey: as read, and its orthophoto in grey.
+        local: metric frame of the region.
+        ground_m: typical height of the surface in it.
+        views: pictures of it to match against, one per hypothesis.
+    """
+
+    window: MapWindow
+    dop_grey: ImageArray
+    local: LocalFrame
+    ground_m: float
+    views: list[ReferenceView]
+
+
+class Localizer:
+    """Camera, map and matcher, put to work on one frame at a time by one thread."""
+
+    def __init__(self, camera: Camera, store: MapStore, matcher: Matcher, options: LocalizerOptions) -> None:
+        self.camera = camera
+        self.matcher = matcher
+        self._store = store
+        self._options = options
+        self._max_error_px = pnp.threshold_px(camera)
+        scale = min(1.0, matcher.working_px / max(camera.width, camera.height))
+        # The size at which the matcher sees the frame; views of the map are drawn at the same size.
+        self._working = camera.pinhole().resized(
+            max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+        )
+        self._map_covariance = _map_covariance(store.pack.manifest)
+        # The frame's features are extracted while the map's part is read, warped and extracted.
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="query-features")
+
+    def close(self) -> None:
+        self._worker.shutdown()
+
+    def localize(self, frame: Frame, prior: PosePrior | RegionPrior) -> Outcome:
+        """The frame's pose, or why there is none. Raises ModelError if the matcher itself fails."""
+        trace = Trace()
+        try:
+            return self._localize(frame, prior, trace)
+        except _RejectedError as stop:
+            return Rejected(
+                frame.stamp_ns, stop.reason, stop.detail, stop.measured, stop.limit, trace.timings_ms()
+            )
+        except MapError as error:
+            # One damaged tile must not end the flight: elsewhere the pack is good.
+            return Rejected(frame.stamp_ns, Reason.MAP_DAMAGED, str(error), timings_ms=trace.timings_ms())
+
+    def _localize(self, frame: Frame, prior: PosePrior | RegionPrior, trace: Trace) -> Fix:
+        grey = self._checked_grey(frame)
+        query = self._worker.submit(self._query_features, grey, trace)
+        try:
+            scene = self._scene(prior, trace)
+            first = self._first_round(query, scene, trace)
+            second = None
+            if self._options.adhop:
+                with trace.stage("adhop"):
+                    second = self._adhop(first, query.result(), scene)
+        finally:
+            query.cancel()
+        with trace.stage("gate"):
+            fix = self._fix(frame, second or first, scene, prior)
+        return replace(
+            fix,
+            adhop_accepted=second is not None if self._options.adhop else None,
+            timings_ms=trace.timings_ms(),
+        )
+
+    def _checked_grey(self, frame: Frame) -> ImageArray:
+        shape, camera = frame.image.shape, self.camera
+        if frame.image.dtype != np.uint8 or shape[:2] != (camera.height, camera.width):
+            raise _RejectedError(
+                Reason.BAD_FRAME,
+                f"{frame.name}: {shape} {frame.image.dtype}, but the camera's intrinsics are for "
+                f"{camera.width} x {camera.height} px of 8 bit",
+            )
+        if frame.image.ndim == 2:
+            return frame.image
+        return np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+    def _query_features(self, grey: ImageArray, trace: Trace) -> Features:
+        with trace.stage("query_features"):
+            return self.matcher.extract(grey)
+
+    # -- where to look ---------------------------------------------------------------------------------
+
+    def _scene(self, prior: PosePrior | RegionPrior, trace: Trace) -> _Scene:
+        if isinstance(prior, RegionPrior):
+            return self._scene_of_region(prior, trace)
+        with trace.stage("map_window"):
+            ground_m, outline = self._predicted_ground(prior)
+            distance_m = self._distance_to_ground(prior, ground_m)
+            gsd_m = distance_m / self._working.focal_px
+            window = self._read(search_bounds(outline, prior, self._options.search_sigmas), gsd_m)
+            dop_grey = precondition.grey_map(window)
+        with trace.stage("view"):
+            local = self._local_frame(window, ground_m)
+            plane = precondition.ground_plane(window, local, outline)
+            if plane is None:
+                raise _RejectedError(
+                    Reason.MAP_NODATA, "the surface model has no data under the predicted view"
+                )
+            error_m = math.hypot(prior.position_sigma_m, distance_m * prior.tilt_sigma_rad)
+            # An error of a tenth of the picture costs overlap that can be spared; beyond it, look wider.
+            widening = 1.5 * error_m / (gsd_m * self._working.width) - 0.1
+            views = [
+                precondition.predicted_view(
+                    window, dop_grey, local, plane, self._working, prior, offset_rad, widening
+                )
+                for offset_rad in _heading_offsets(prior.heading_sigma_rad)
+            ]
+            if not any(view.valid.any() for view in views):
+                raise _RejectedError(Reason.MAP_NODATA, "the orthophoto has no data in the predicted view")
+        return _Scene(window, dop_grey, local, ground_m, views)
+
+    def _scene_of_region(self, prior: RegionPrior, trace: Trace) -> _Scene:
+        with trace.stage("map_window"):
+            west, south, east, north = prior.bounds_map
+            window = self._read(prior.bounds_map, max(east - west, north - south) / self.matcher.working_px)
+            dop_grey = precondition.grey_map(window)
+            known = window.dsm[np.isfinite(window.dsm)]
+            if not len(known):
+                raise _RejectedError(Reason.MAP_NODATA, "the surface model has no data in the region")
+            ground_m = float(np.median(known))
+        with trace.stage("view"):
+            views = precondition.quarter_turns(window, dop_grey)
+        return _Scene(window, dop_grey, self._local_frame(window, ground_m), ground_m, views)
+
+    def _predicted_ground(self, prior: PosePrior) -> tuple[float, FloatArray]:
+        """Typical height of the surface in the predicted view, and the view's footprint (K, 2) on it."""
+        pose = prior.map_from_camera
+        ground_m = math.nan
+        for reach_m in _GROUND_REACH_M:
+            offsets = np.linspace(-reach_m, reach_m, 7)
+            around = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2) + pose.translation[:2]
+            heights = self._store.heights(around)
+            if np.isfinite(heights).any():
+                ground_m = float(np.nanmedian(heights))
+                break
+        if math.isnan(ground_m):
+            raise _RejectedError(
+                Reason.OUTSIDE_MAP,
+                f"no surface model within {_GROUND_REACH_M[-1]:.0f} m of the predicted position "
+                f"({pose.translation[0]:.0f}, {pose.translation[1]:.0f})",
+            )
+        outline = np.empty((0, 2))
+        for _ in range(2):
+            height_m = float(pose.translation[2]) - ground_m
+            if height_m <= 0:
+                raise _RejectedError(
+                    Reason.PRIOR_DISAGREES,
+                    "the predicted camera lies below the surface model; check the vertical datum of pack and "
+                    "autopilot",
+                    height_m,
+                    0.0,
+                )
+            outline = footprint(self.camera, pose, ground_m)
+            heights = self._store.heights(outline)
+            if np.isfinite(heights).any():
+                ground_m = min(float(np.nanmedian(heights)), float(pose.translation[2]) - 0.2 * height_m)
+        return ground_m, outline
+
+    def _distance_to_ground(self, prior: PosePrior, ground_m: float) -> float:
+        """Along the optical axis, at most `MAX_RANGE_HEIGHTS` heights."""
+        height_m = float(prior.map_from_camera.translation[2]) - ground_m
+        falling = -float(prior.map_from_camera.rotation[2, 2])
+        return height_m / max(falling, 1.0 / MAX_RANGE_HEIGHTS)
+
+    def _read(self, bounds: Bounds, gsd_m: float) -> MapWindow:
+        west, south, east, north = bounds
+        limit = self._options.max_window_mpx * 1e6
+        # The store may give a level finer by a factor of two than was asked for.
+        coarsest_m = math.sqrt((east - west) * (north - south) / limit) * 2.0
+        if coarsest_m > _MAX_COARSENING * gsd_m:
+            raise _RejectedError(
+                Reason.PRIOR_TOO_WIDE,
+                f"the search would cover {east - west:.0f} x {north - south:.0f} m; pixel for the matcher, m",
+                coarsest_m,
+                _MAX_COARSENING * gsd_m,
+            )
+        window = self._store.read(bounds, max(gsd_m, coarsest_m))
+        if window is None:
+            raise _RejectedError(
+                Reason.OUTSIDE_MAP,
+                f"({west:.0f}, {south:.0f}) to ({east:.0f}, {north:.0f}) does not meet the pack",
+            )
+        if not window.dop_valid.any():
+            raise _RejectedError(Reason.MAP_NODATA, "the orthophoto has no data in the region")
+        return window
+
+    def _local_frame(self, window: MapWindow, ground_m: float) -> LocalFrame:
+        west, south, east, north = window.dop_grid.bounds
+        return self._store.pack.georeference.local_frame(
+            ((west + east) / 2, (south + north) / 2), ground_m
+        )
+
+    # -- matching and pose -----------------------------------------------------------------------------
+
+    def _first_round(self, query: Future[Features], scene: _Scene, trace: Trace) -> _Round:
+        """The hypothesis with the most matches (paper: "selecting the one with most correspondences")."""
+        best: tuple[Matches, ReferenceView] | None = None
+        for view in scene.views:
+            with trace.stage("map_features"):
+                features = self.matcher.extract(view.image, view.valid)
+            query_features = query.result()
+            with trace.stage("match"):
+                matches = self.matcher.match(query_features, features)
+            if best is None or len(matches) > len(best[0]):
+                best = (matches, view)
+        if best is None:
+            raise _RejectedError(Reason.NO_PRIOR, "no hypothesis to look at")
+        with trace.stage("pose"):
+            return self._solved(*best, scene)
+
+    def _adhop(self, first: _Round, query: Features, scene: _Scene) -> _Round | None:
+        """The paper's refinement: None unless the second round's mean reprojection error is smaller."""
+        threshold_px = self._options.homography_threshold_px * self._max_error_px / pnp.THRESHOLD_PX
+        fitted = fit_homography(first.matches.map_px, first.matches.query_px, threshold_px)
+        if fitted is None:
+            return None
+        working = self._working
+        scale = working.width / self.camera.width, working.height / self.camera.height
+        # Pixels of the frame to pixels of the matcher's size: (k + 0.5) s - 0.5.
+        shrink = np.array(
+            [
+                [scale[0], 0.0, 0.5 * scale[0] - 0.5],
+                [0.0, scale[1], 0.5 * scale[1] - 0.5],
+                [0.0, 0.0, 1.0],
+            ]
+        )
+        view = precondition.warped(
+            scene.dop_grey, scene.window.dop_valid, shrink @ fitted[0], working.width, working.height
+        )
+        matches = self.matcher.match(query, self.matcher.extract(view.image, view.valid))
+        second = self._solved(matches, view, scene)
+        return second if second.mean_error_px < first.mean_error_px else None
+
+    def _solved(self, matches: Matches, view: ReferenceView, scene: _Scene) -> _Round:
+        """A round's matches back on the orthophoto, filtered, lifted and solved."""
+        on_frame = self.camera.contains(matches.query_px)
+        if matches.confidence is not None:
+            on_frame &= matches.confidence >= MIN_CONFIDENCE
+        matches = matches.take(np.flatnonzero(on_frame))
+        matches = Matches(
+            self.camera.undistorted_px(matches.query_px), view.dop_px(matches.map_px), matches.confidence
+        )
+        matches = matches.take(np.flatnonzero(np.isfinite(matches.map_px).all(axis=1)))
+        lifted = lift(matches.map_px, scene.window)
+        estimate = None
+        if len(lifted.kept) >= _MIN_MATCHES:
+            points = scene.local.local_from_map(lifted.points_map)
+            estimate = self._pose(points, matches.query_px[lifted.kept])
+        mean_px = math.inf
+        if estimate is not None:
+            # A match behind the camera has no error in pixels; the image's diagonal stands for it.
+            diagonal = math.hypot(self.camera.width, self.camera.height)
+            mean_px = float(np.minimum(estimate.errors_px, diagonal).mean())
+        return _Round(matches, lifted.kept, lifted.points_map, estimate, mean_px)
+
+    def _pose(self, points_local: FloatArray, query_px: FloatArray) -> pnp.PoseEstimate | None:
+        if self._options.calibrate:
+            return calibrate.solve(points_local, query_px, self.camera.width, self.camera.height)
+        return pnp.solve(points_local, query_px, self.camera, max_error_px=self._max_error_px)
+
+    # -- judgement -------------------------------------------------------------------------------------
+
+    def _fix(
+        self, frame: Frame, chosen: _Round, scene: _Scene, prior: PosePrior | RegionPrior
+    ) -> Fix:
+        estimate = chosen.estimate
+        if len(chosen.kept) < _MIN_MATCHES:
+            raise _RejectedError(
+                Reason.FEW_MATCHES,
+                f"{len(chosen.matches)} matches, of which with a height",
+                len(chosen.kept),
+                _MIN_MATCHES,
+            )
+        if estimate is None:
+            raise _RejectedError(Reason.DEGENERATE_GEOMETRY, "the matches do not determine a pose")
+        if estimate.focal_sigma_px is not None:
+            relative = estimate.focal_sigma_px / estimate.camera.focal_px
+            if relative > calibrate.MAX_RELATIVE_FOCAL_SIGMA:
+                raise _RejectedError(
+                    Reason.DEGENERATE_GEOMETRY,
+                    "focal length and height can't be told apart; relative 1-sigma of the focal length",
+                    relative,
+                    calibrate.MAX_RELATIVE_FOCAL_SIGMA,
+                )
+        pose = scene.local.map_from_local_pose(estimate.local_from_camera)
+        covariance = estimate.covariance + self._map_covariance
+        below = float(self._store.heights(pose.translation[None, :2])[0])
+        height_m = float(pose.translation[2]) - (below if math.isfinite(below) else scene.ground_m)
+        query_px = chosen.matches.query_px[chosen.kept]
+        refusal = gate.check(
+            estimate,
+            query_px,
+            pose,
+            covariance,
+            height_m,
+            prior if isinstance(prior, PosePrior) else None,
+            self._max_error_px,
+            self._options.gate,
+        )
+        if refusal is not None:
+            raise _RejectedError(refusal.reason, refusal.detail, refusal.measured, refusal.limit)
+        inliers = estimate.inliers
+        return Fix(
+            stamp_ns=frame.stamp_ns,
+            map_from_camera=pose,
+            camera=estimate.camera,
+            focal_sigma_px=estimate.focal_sigma_px,
+            covariance=covariance,
+            quality=float(inliers.mean()),
+            matches=len(chosen.matches),
+            inliers=int(np.count_nonzero(inliers)),
+            rms_px=estimate.rms_px,
+            adhop_accepted=None,
+            query_px=query_px[inliers],
+            points_map=chosen.points_map[inliers],
+        )
+
+
+def _map_covariance(manifest: Manifest) -> FloatArray:
+    """(6, 6): what is wrong with the map alike everywhere, which no number of matches averages out.
+
+    Half a pixel of either raster where the manifest does not state a sigma: how well the publisher's grids can
+    be trusted at all.
+    """
+    planimetric_m = _UNSTATED_SIGMA_PX * manifest.dop.gsd_m if manifest.dop.sigma_m is None else manifest.dop.sigma_m
+    vertical_m = _UNSTATED_SIGMA_PX * manifest.dsm.gsd_m if manifest.dsm.sigma_m is None else manifest.dsm.sigma_m
+    vertical_m = math.hypot(vertical_m, manifest.dsm.max_z_error_m)
+    return np.diag(np.square([planimetric_m, planimetric_m, vertical_m, 0.0, 0.0, 0.0]))
+
+
+def _heading_offsets(heading_sigma_rad: float) -> list[float]:
+    """Headings to try: the predicted one, and where it is poorly known, steps to both sides."""
+    steps = min(round(2.0 * heading_sigma_rad / _HEADING_STEP_RAD - 0.5), _MAX_HEADING_STEPS)
+    if steps >= _MAX_HEADING_STEPS:
+        return [_HEADING_STEP_RAD * k for k in range(2 * _MAX_HEADING_STEPS)]
+    return [0.0, *(sign * _HEADING_STEP_RAD * k for k in range(1, steps + 1) for sign in (1, -1))]

@@ -1,0 +1,177 @@
+"""The orthophoto brought near to what the camera sees, before anything is matched.
+
+With a prior pose the perspective gap that AdHoP closes after a first match is closed before it: the orthophoto
+is warped into the predicted view through the plane that fits the surface model best. Without one the region is
+shown in four quarter turns, as the paper does for matchers that are not invariant to rotation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ortholoc_edge.geometry import homography, rotation
+from ortholoc_edge.geometry.arrays import BoolArray, FloatArray, ImageArray
+from ortholoc_edge.geometry.camera import Camera
+from ortholoc_edge.geometry.rigid import Rigid3
+from ortholoc_edge.pipeline.prior import MAX_RANGE_HEIGHTS, PosePrior
+from ortholoc_edge.pose.lift import bilinear
+from ortholoc_edge.tiles.georeference import LocalFrame
+from ortholoc_edge.tiles.window import MapWindow
+
+_PLANE_SAMPLES = 24
+# A widened view shrinks in the matcher; XFeat bears a factor of two (matchers.md, "Rotation" and "Scale").
+_MAX_WIDENING = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReferenceView:
+    """A picture of the map to match the frame against.
+
+    Attributes:
+        image: (H, W) uint8 grey.
+        valid: (H, W) bool, False where it shows no map.
+        view_from_dop: (3, 3) homography from the window's DOP pixels to this picture's.
+    """
+
+    image: ImageArray
+    valid: BoolArray
+    view_from_dop: FloatArray
+
+    def dop_px(self, view_px: FloatArray) -> FloatArray:
+        """DOP pixels (N, 2) of pixels of this picture; AdHoP's inverse mapping."""
+        inverse = np.linalg.inv(self.view_from_dop)
+        # The sign of a homography is free; here it makes what the picture shows positive.
+        centre = (np.array(self.image.shape[::-1]) - 1) / 2
+        return homography.warp_points(homography.positive_at(inverse, centre), view_px)
+
+
+def grey_map(window: MapWindow) -> ImageArray:
+    """The window's orthophoto in grey."""
+    return np.asarray(cv2.cvtColor(window.dop, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+
+def warped(dop_grey: ImageArray, dop_valid: BoolArray, view_from_dop: FloatArray, width: int, height: int) -> ReferenceView:
+    """The orthophoto through a homography, and where that shows map."""
+    size = (width, height)
+    image = cv2.warpPerspective(dop_grey, view_from_dop, size, flags=cv2.INTER_LINEAR)
+    valid = cv2.warpPerspective(dop_valid.astype(np.uint8), view_from_dop, size, flags=cv2.INTER_NEAREST)
+    return ReferenceView(np.asarray(image, dtype=np.uint8), valid.astype(bool), view_from_dop)
+
+
+def ground_plane(window: MapWindow, local: LocalFrame, outline_map: FloatArray) -> FloatArray | None:
+    """The plane ``z = a + b x + c y`` (local metres) that fits the surface under a footprint best.
+
+    Twice re-weighted by the median residual, so that roofs and trees bend it little.
+
+    Args:
+        outline_map: (K, 2) points that span the footprint.
+    Returns: (3,) a, b, c; None where the surface model has no data.
+    """
+    low, high = outline_map.min(axis=0), outline_map.max(axis=0)
+    x, y = np.meshgrid(
+        np.linspace(low[0], high[0], _PLANE_SAMPLES), np.linspace(low[1], high[1], _PLANE_SAMPLES)
+    )
+    xy_map = np.column_stack([x.ravel(), y.ravel()])
+    heights = bilinear(window.dsm, window.dsm_grid.px_from_map(xy_map))
+    known = np.isfinite(heights)
+    if np.count_nonzero(known) < 3:
+        return None
+    points = local.local_from_map(np.column_stack([xy_map[known], heights[known]]))
+    centre = points.mean(axis=0)
+    design = np.column_stack([np.ones(len(points)), points[:, :2] - centre[:2]])
+    weights = np.ones(len(points))
+    level = np.array([float(np.median(points[:, 2])), 0.0, 0.0])
+    if len(points) < _PLANE_SAMPLES:
+        # Too little of the surface is known to tell its slope.
+        return level
+    plane = level
+    for _ in range(3):
+        root = np.sqrt(weights)
+        plane, *_ = np.linalg.lstsq(design * root[:, None], points[:, 2] * root, rcond=None)
+        residuals = np.abs(points[:, 2] - design @ plane)
+        weights = 1.0 / np.maximum(residuals, max(float(np.median(residuals)), 0.05))
+    a = plane[0] - plane[1] * centre[0] - plane[2] * centre[1]
+    return np.array([a, plane[1], plane[2]])
+
+
+def view_homography(window: MapWindow, local: LocalFrame, plane: FloatArray, camera: Camera, local_from_camera: Rigid3) -> FloatArray:
+    """(3, 3) from DOP pixels to pixels of a pinhole camera, for ground on a plane ``z = a + b x + c y``."""
+    grid = window.dop_grid.map_from_px_matrix()
+    shrink = 1.0 / local.grid_scale
+    xy_local = np.array(
+        [
+            [shrink, 0.0, -local.origin_easting_m * shrink],
+            [0.0, shrink, -local.origin_northing_m * shrink],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    on_plane = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [plane[1], plane[2], plane[0]], [0.0, 0.0, 1.0]])
+    inverse = local_from_camera.inverse()
+    camera_from_local = np.column_stack([inverse.rotation, inverse.translation])
+    return np.asarray(camera.matrix @ camera_from_local @ on_plane @ xy_local @ grid, dtype=np.float64)
+
+
+def predicted_view(
+    window: MapWindow,
+    dop_grey: ImageArray,
+    local: LocalFrame,
+    plane: FloatArray,
+    camera: Camera,
+    prior: PosePrior,
+    heading_offset_rad: float,
+    widening: float,
+) -> ReferenceView:
+    """The orthophoto as the camera should see it.
+
+    Args:
+        camera: pinhole at the working size.
+        heading_offset_rad: added to the prior's heading (clockwise), for priors that hardly know it.
+        widening: part of the long side by which the view shows more on every side.
+    """
+    margin = round(min(max(widening, 0.0), _MAX_WIDENING) * max(camera.width, camera.height))
+    camera = camera.padded(margin)
+    predicted = local.local_from_map_pose(prior.map_from_camera)
+    turned = rotation.exp([0.0, 0.0, -heading_offset_rad]) @ predicted.rotation
+    local_from_camera = Rigid3(turned, predicted.translation)
+    matrix = view_homography(window, local, plane, camera, local_from_camera)
+    view = warped(dop_grey, window.dop_valid, matrix, camera.width, camera.height)
+    ahead = _sees_ground(camera, local_from_camera, plane)
+    return view if ahead is None else ReferenceView(view.image, view.valid & ahead, matrix)
+
+
+def _sees_ground(camera: Camera, local_from_camera: Rigid3, plane: FloatArray) -> BoolArray | None:
+    """Which pixels see the plane in front of the camera and within range; None if all do.
+
+    Beyond the horizon a homography shows the ground behind the camera, upside down.
+    """
+    normal = np.array([-plane[1], -plane[2], 1.0])
+    drop = float(normal @ local_from_camera.translation - plane[0])
+    in_camera = local_from_camera.rotation.T @ normal
+    u = (np.arange(camera.width) - camera.cx) / camera.fx
+    v = (np.arange(camera.height) - camera.cy) / camera.fy
+    falling = -(in_camera[0] * u[None, :] + in_camera[1] * v[:, None] + in_camera[2])
+    if falling.min() * MAX_RANGE_HEIGHTS >= 1.0 and drop > 0:
+        return None
+    return np.asarray((falling * MAX_RANGE_HEIGHTS >= 1.0) & (drop > 0))
+
+
+def quarter_turns(window: MapWindow, dop_grey: ImageArray) -> list[ReferenceView]:
+    """The window as it is and turned by 90, 180 and 270 degrees counter-clockwise (paper: "RI")."""
+    bottom, right = dop_grey.shape[0] - 1.0, dop_grey.shape[1] - 1.0
+    from_dop = (
+        np.eye(3),
+        np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, right], [0.0, 0.0, 1.0]]),
+        np.array([[-1.0, 0.0, right], [0.0, -1.0, bottom], [0.0, 0.0, 1.0]]),
+        np.array([[0.0, -1.0, bottom], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+    )
+    return [
+        ReferenceView(
+            np.ascontiguousarray(np.rot90(dop_grey, turns)),
+            np.ascontiguousarray(np.rot90(window.dop_valid, turns)),
+            matrix,
+        )
+        for turns, matrix in enumerate(from_dop)
+    ]

@@ -1,0 +1,170 @@
+"""From frame to frame: the one place that remembers the last fix and says where to look next."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta, Struct
+
+from ortholoc_edge.geometry import covariance as cov
+from ortholoc_edge.geometry import frames
+from ortholoc_edge.geometry.arrays import FloatArray
+from ortholoc_edge.geometry.rigid import Rigid3
+from ortholoc_edge.pipeline.frame import VehicleState
+from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
+from ortholoc_edge.pipeline.prior import PosePrior
+from ortholoc_edge.tiles.georeference import Georeference
+
+
+class TrackerOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How fast the prediction loses certainty between fixes.
+
+    ``odometry_ratio``: error of the autopilot's displacement as a part of the distance flown.
+    ``odometry_drift_m_per_s``: and as a function of time.
+    ``unaided_speed_m_per_s``: without odometry, the speed at which the vehicle may have left.
+    ``lost_sigma_m``: horizontal 1-sigma beyond which nothing is known worth predicting from.
+    ``jump_m``: a fix this far from the prediction raises the reset counter, if it is also beyond three sigmas.
+    """
+
+    odometry_ratio: Annotated[float, Meta(ge=0, le=1)] = 0.03
+    odometry_drift_m_per_s: Annotated[float, Meta(ge=0)] = 0.2
+    unaided_speed_m_per_s: Annotated[float, Meta(gt=0)] = 15.0
+    lost_sigma_m: Annotated[float, Meta(gt=0)] = 150.0
+    jump_m: Annotated[float, Meta(gt=0)] = 5.0
+
+
+class TrackerStatus(StrEnum):
+    """SEARCH: no idea where. TRACK: the last frame gave a fix. COAST: carried on from an older fix."""
+
+    SEARCH = "search"
+    TRACK = "track"
+    COAST = "coast"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Anchor:
+    """Where the body was at the last fix, and what the odometry said then."""
+
+    stamp_ns: int
+    position_map_m: FloatArray
+    covariance: FloatArray
+    odometry_ned_m: FloatArray | None
+    odometry_epoch: int
+
+
+class Tracker:
+    """Predicts a `PosePrior` for each frame and learns from its outcome; used by one thread."""
+
+    def __init__(self, georeference: Georeference, body_from_camera: Rigid3, options: TrackerOptions) -> None:
+        self._georeference = georeference
+        self._body_from_camera = body_from_camera
+        self._options = options
+        self._anchor: _Anchor | None = None
+        self._last_prior: PosePrior | None = None
+        self.status = TrackerStatus.SEARCH
+        self.reset_counter = 0
+
+    def predict(self, state: VehicleState) -> PosePrior | Rejected:
+        """The pose to expect at the state's stamp, or why there is none."""
+        self._last_prior = None
+        attitude = state.ned_from_body
+        if attitude is None or not np.isfinite(attitude).all() or not np.isfinite(state.attitude_sigma_rad).all():
+            return Rejected(
+                state.stamp_ns, Reason.BAD_ATTITUDE, "no finite attitude from the autopilot at the exposure"
+            )
+        carried = self._carried(state)
+        absolute = self._absolute(state)
+        known = [p for p in (carried, absolute) if p is not None and _sigma(p[1]) <= self._options.lost_sigma_m]
+        if not known:
+            detail = "no fix yet and no position from the autopilot"
+            if carried is not None:
+                detail = "the last fix is too old to predict from; horizontal 1-sigma, m"
+            return Rejected(
+                state.stamp_ns,
+                Reason.NO_PRIOR,
+                detail,
+                None if carried is None else _sigma(carried[1]),
+                self._options.lost_sigma_m,
+            )
+        position, position_covariance = min(known, key=lambda p: _sigma(p[1]))
+        map_from_ned = frames.map_from_ned_rotation(self._georeference.convergence_rad(position[:2]))
+        body = Rigid3(map_from_ned @ attitude, position)
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3] = position_covariance
+        covariance[3:, 3:] = cov.attitude(body.rotation, state.attitude_sigma_rad)
+        lever = body.rotation @ self._body_from_camera.translation
+        self._last_prior = PosePrior(body @ self._body_from_camera, cov.of_moved_point(covariance, lever))
+        return self._last_prior
+
+    def update(self, outcome: Outcome, state: VehicleState) -> None:
+        """Learn from what the frame of the last `predict` came to."""
+        if isinstance(outcome, Rejected):
+            if self._anchor is not None:
+                self.status = TrackerStatus.COAST
+            return
+        if self.status is TrackerStatus.SEARCH or self._jumped(outcome):
+            self.reset_counter = (self.reset_counter + 1) % 256
+        body = outcome.map_from_camera @ self._body_from_camera.inverse()
+        lever = body.translation - outcome.map_from_camera.translation
+        covariance = cov.of_moved_point(outcome.covariance, lever)
+        odometry = state.odometry_ned_m
+        self._anchor = _Anchor(
+            state.stamp_ns,
+            body.translation,
+            covariance[:3, :3],
+            None if odometry is None or not np.isfinite(odometry).all() else odometry,
+            state.odometry_epoch,
+        )
+        self.status = TrackerStatus.TRACK
+
+    def _jumped(self, fix: Fix) -> bool:
+        if self._last_prior is None:
+            return True
+        step = fix.map_from_camera.translation - self._last_prior.map_from_camera.translation
+        spread = (self._last_prior.covariance + fix.covariance)[:3, :3]
+        return float(np.linalg.norm(step)) > self._options.jump_m and cov.mahalanobis_squared(step, spread) > 9.0
+
+    def _carried(self, state: VehicleState) -> tuple[FloatArray, FloatArray] | None:
+        """The last fix moved by the odometry since: position and its covariance."""
+        anchor = self._anchor
+        if anchor is None:
+            return None
+        options = self._options
+        elapsed_s = max(state.stamp_ns - anchor.stamp_ns, 0) * 1e-9
+        odometry = state.odometry_ned_m
+        moved = (
+            odometry is not None
+            and anchor.odometry_ned_m is not None
+            and state.odometry_epoch == anchor.odometry_epoch
+            and np.isfinite(odometry).all()
+        )
+        if not moved or odometry is None or anchor.odometry_ned_m is None:
+            sigma_m = options.unaided_speed_m_per_s * elapsed_s
+            return anchor.position_map_m, anchor.covariance + np.eye(3) * sigma_m**2
+        step_ned = odometry - anchor.odometry_ned_m
+        xy = anchor.position_map_m[:2]
+        turn = frames.map_from_ned_rotation(self._georeference.convergence_rad(xy))
+        step = turn @ step_ned
+        step[:2] *= self._georeference.grid_scale(xy, float(anchor.position_map_m[2]))
+        # A constant drift grows with time; a scale or heading error grows with the distance.
+        sigma_m = math.hypot(
+            options.odometry_ratio * float(np.linalg.norm(step)), options.odometry_drift_m_per_s * elapsed_s
+        )
+        return anchor.position_map_m + step, anchor.covariance + np.eye(3) * sigma_m**2
+
+    def _absolute(self, state: VehicleState) -> tuple[FloatArray, FloatArray] | None:
+        """A trusted position of the autopilot's own."""
+        position = state.position_map_m
+        if position is None or not np.isfinite(position).all():
+            return None
+        horizontal_m, vertical_m = state.position_sigma_m
+        return position, np.diag(np.square([horizontal_m, horizontal_m, vertical_m]))
+
+
+def _sigma(covariance: FloatArray) -> float:
+    """Along the worst horizontal direction, m."""
+    return float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]))

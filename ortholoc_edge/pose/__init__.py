@@ -1,0 +1,1 @@
+"""Pixel pairs in, a pose with an honest covariance out."""
