@@ -1,0 +1,56 @@
+"""Matchers by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+from ortholoc_edge.errors import ConfigError
+from ortholoc_edge.matching import models
+from ortholoc_edge.matching.sift import SiftMatcher
+from ortholoc_edge.matching.types import Matcher
+
+MATCHERS: Final = ("xfeat", "sift")
+
+
+def make_matcher(
+    name: str,
+    *,
+    working_px: int,
+    threads: int,
+    model_path: Path | None = None,
+    model_sha256: str | None = None,
+    progress: models.Progress | None = None,
+) -> Matcher:
+    """The matcher of this name, its model loaded (and built first where the store lacks it).
+
+    Args:
+        name: one of ``MATCHERS``.
+        working_px: long side that images are brought to.
+        threads: of one inference; SIFT takes OpenCV's setting (``cv2.setNumThreads``).
+        model_path: a model file instead of the store's.
+        model_sha256: hash that the file must have; None: the record beside the file says it.
+        progress: told of a build's steps.
+    Raises: ConfigError for an unknown name, a number out of range or a model where none is used;
+        ModelError if the model can't be had.
+    """
+    if name not in MATCHERS:
+        raise ConfigError(f"matcher {name!r} is not known; known are: {', '.join(MATCHERS)}")
+    if model_path is None and model_sha256 is not None:
+        raise ConfigError("a model's SHA-256 was given without the model's file; give both or none")
+    try:
+        if name == "sift":
+            if model_path is not None:
+                raise ConfigError(f"matcher 'sift' uses no model; leave {model_path} away")
+            return SiftMatcher(working_px=working_px)
+        # Not at the top: SIFT must work where the inference runtime does not.
+        from ortholoc_edge.matching.xfeat import XFeatMatcher  # noqa: PLC0415
+
+        model = (
+            models.ensure(name, progress)
+            if model_path is None
+            else models.load_file(model_path, model_sha256)
+        )
+        return XFeatMatcher(model.graph, model.sha256, working_px=working_px, threads=threads)
+    except ValueError as err:
+        raise ConfigError(f"matcher {name}: {err}") from err

