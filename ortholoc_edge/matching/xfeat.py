@@ -69,18 +69,14 @@ class XFeatNetwork:
                 f"expected {[_INPUT]} and {_OUTPUTS}; this is another model's file"
             )
 
-    def run(
-        self, grey: ImageArray, usable: BoolArray | None = None
-    ) -> tuple[Float32Array, Float32Array, Float32Array]:
+    def run(self, grey: ImageArray, usable: BoolArray | None = None) -> tuple[Float32Array, Float32Array, Float32Array]:
         """Features (1, 64, H/8, W/8), heat (1, 1, H, W), reliability (1, 1, H/8, W/8) of ``grey``
         (H, W), normalised over ``usable`` (H, W) or all of it.
 
         Raises: ModelError if the runtime fails.
         """
         try:
-            features, heat, reliability = self._session.run(
-                _OUTPUTS, {_INPUT: _normalised(grey, usable)[None, None]}
-            )
+            features, heat, reliability = self._session.run(_OUTPUTS, {_INPUT: _normalised(grey, usable)[None, None]})
         except Exception as err:
             raise ModelError(
                 f"XFeat inference failed on {grey.shape[1]} x {grey.shape[0]} px ({err}); "
@@ -98,7 +94,7 @@ class XFeatMatcher:
         working_px: long side that images are brought to, a multiple of 32. Both sides are rounded to
             multiples of 32, so the aspect changes by a few per cent and the two axes are scaled back apart.
         max_keypoints: kept per image, best first.
-        min_cosine: of two descriptors to match; 0.82 as published for photos of one place.
+        min_cosine: of two descriptors to match; 0.82 is the published matcher's default.
         threads: of one inference. NumPy's BLAS has its own, OPENBLAS_NUM_THREADS=1 is best for :meth:`match`.
     Raises: ModelError if the graph's hash differs or it can't be loaded; ValueError for an unusable number.
     """

@@ -31,7 +31,7 @@ _IR_VERSION: Final = 10  # the oldest that holds opset 20, so that older runtime
 _EPSILON: Final = 1e-5  # torch's default for batch normalisation
 _CELL: Final = 8
 # exp(80) summed 65 times still fits float32. Logits on photos stay under 30, so the limit changes nothing
-# there.
+# there; one white pixel on black reaches 94, which would give NaN.
 _MAX_LOGIT: Final = 80.0
 
 # Block -> stride of its first convolution and of each next one.

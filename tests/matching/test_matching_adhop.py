@@ -107,9 +107,7 @@ def test_input_is_checked() -> None:
     st.sampled_from([(), (3,)]),
     st.integers(0, 99),
 )
-def test_quarter_turns_come_back_exactly(
-    rows: int, columns: int, k: int, channels: tuple[int, ...], seed: int
-) -> None:
+def test_quarter_turns_come_back_exactly(rows: int, columns: int, k: int, channels: tuple[int, ...], seed: int) -> None:
     rng = np.random.default_rng(seed)
     image = rng.integers(0, 255, (rows, columns, *channels), dtype=np.uint8)
     turned = rotate_quarter(image, k)
@@ -121,7 +119,5 @@ def test_quarter_turns_come_back_exactly(
     np.testing.assert_array_equal(image[at[..., 1], at[..., 0]], turned)
     np.testing.assert_array_equal(rotate_quarter(turned, -k), image)
     # Linear, so that subpixel positions are as exact.
-    half = unrotate_px(np.array([0.25, 0.5]), k, image.shape) - unrotate_px(
-        np.array([0.0, 0.0]), k, image.shape
-    )
+    half = unrotate_px(np.array([0.25, 0.5]), k, image.shape) - unrotate_px(np.array([0.0, 0.0]), k, image.shape)
     assert sorted(np.abs(half)) == [0.25, 0.5]

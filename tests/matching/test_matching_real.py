@@ -54,9 +54,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("name", "path", "enough"), CASES)
-def test_photo_matches_its_orthophoto(
-    request: pytest.FixtureRequest, name: str, path: str, enough: int
-) -> None:
+def test_photo_matches_its_orthophoto(request: pytest.FixtureRequest, name: str, path: str, enough: int) -> None:
     query, dop, valid, true = _sample(path)
     matcher: Matcher = SiftMatcher()
     if name == "xfeat":
