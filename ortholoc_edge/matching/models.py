@@ -422,7 +422,7 @@ def verify(name: str, graph: bytes) -> dict[str, float]:
     Raises: ModelError if the graph can't be run or differs by more than ``REFERENCE_TOLERANCE``.
     """
     # Not at the top: `models list` and the tests of the store need no inference runtime.
-    from ortholoc_edge.matching.xfeat import XFeatNetwork  # noqa: PLC0415
+    from ortholoc_edge.matching.xfeat import XFeatNetwork
 
     network = XFeatNetwork(graph, sha256_of(graph), threads=1)
     sample = reference_sample(*network.run(reference_image()))

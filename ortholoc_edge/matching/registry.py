@@ -44,7 +44,7 @@ def make_matcher(
                 raise ConfigError(f"matcher 'sift' uses no model; leave {model_path} away")
             return SiftMatcher(working_px=working_px)
         # Not at the top: SIFT must work where the inference runtime does not.
-        from ortholoc_edge.matching.xfeat import XFeatMatcher  # noqa: PLC0415
+        from ortholoc_edge.matching.xfeat import XFeatMatcher
 
         model = (
             models.ensure(name, progress)
