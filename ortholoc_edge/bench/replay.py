@@ -87,7 +87,7 @@ class PriorNoise:
     attitude_deg: tuple[float, float, float] = (1.0, 1.0, 3.0)
     position: tuple[Length, Length] = (Length(metres=2.0), Length(metres=2.0))
     odometry_ratio: float = 0.02
-    odometry_drift_m_per_s: float = 0.1
+    odometry_drift_m_per_s: float = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,7 +180,7 @@ def replay_flight(
         ground_m: height of the surface at a map position (2,); may be NaN.
     """
     autopilot = SimulatedAutopilot(kind, noise, seed)
-    tracker = Tracker(georeference, sequence.nadir_body(), TrackerOptions())
+    tracker = Tracker(georeference, sequence.nadir_body(), _tracker_options(noise))
     random = np.random.default_rng([seed, 1])
     last_ground_m = math.nan
     for record in recorded:
@@ -223,6 +223,15 @@ def replay_flight(
         yield FrameResult(
             record.name, record.stamp_ns, image, record.camera, truth, prior, outcome, _error(outcome, truth), cpu_ms
         )
+
+
+def _tracker_options(noise: PriorNoise) -> TrackerOptions:
+    """The tracker is told what odometry it has, as an integrator would, with some reserve."""
+    reserve = 1.25
+    return TrackerOptions(
+        odometry_ratio=min(reserve * noise.odometry_ratio, 1.0),
+        odometry_drift_m_per_s=reserve * noise.odometry_drift_m_per_s,
+    )
 
 
 def replay_sample(

@@ -13,44 +13,15 @@ from ortholoc_edge.bench import draw
 from ortholoc_edge.bench.metrics import Spread, Summary
 from ortholoc_edge.bench.replay import FrameResult
 from ortholoc_edge.errors import OrtholocError
-from ortholoc_edge.geometry import rotation
-from ortholoc_edge.pipeline.outcome import Fix, Outcome
+from ortholoc_edge.pipeline.outcome import Fix
+from ortholoc_edge.pipeline.record import outcome_record
 from ortholoc_edge.tiles.store import MapStore
-
-
-def outcome_record(outcome: Outcome) -> dict[str, Any]:
-    """An outcome as plain values, for JSON."""
-    if not isinstance(outcome, Fix):
-        return {
-            "fix": False,
-            "reason": str(outcome.reason),
-            "detail": outcome.detail,
-            "measured": outcome.measured,
-            "limit": outcome.limit,
-            "timings_ms": outcome.timings_ms,
-        }
-    pose = outcome.map_from_camera
-    return {
-        "fix": True,
-        "position_map_m": pose.translation.tolist(),
-        "quaternion_map_from_camera_wxyz": rotation.to_quaternion(pose.rotation).tolist(),
-        "covariance": outcome.covariance.tolist(),
-        "quality": outcome.quality,
-        "matches": outcome.matches,
-        "inliers": outcome.inliers,
-        "rms_px": outcome.rms_px,
-        "adhop_accepted": outcome.adhop_accepted,
-        "focal_px": outcome.camera.focal_px,
-        "focal_sigma_px": outcome.focal_sigma_px,
-        "timings_ms": outcome.timings_ms,
-    }
 
 
 def frame_record(result: FrameResult) -> dict[str, Any]:
     """One line of ``frames.jsonl``."""
     return {
         "name": result.name,
-        "stamp_ns": result.stamp_ns,
         **outcome_record(result.outcome),
         "te_m": result.error and result.error.te_m,
         "re_deg": result.error and result.error.re_deg,
@@ -82,9 +53,7 @@ class FrameWriter:
         except OSError as err:
             raise OrtholocError(f"{self._folder}: can't write results ({err})") from err
         if result.image is not None:
-            picture = draw.overlay(
-                result.image, result.outcome, result.truth, result.camera, frame_caption(result)
-            )
+            picture = draw.overlay(result.image, result.outcome, result.truth, result.camera, frame_caption(result))
             draw.write_png(self._folder / "overlays" / f"{result.name}.png", picture)
 
     def close(self) -> None:
@@ -134,22 +103,30 @@ def table(summary: Summary) -> str:
 
     rows = [
         ("sequence", f"{summary.sequence} on {summary.pack}"),
-        ("matcher", f"{summary.matcher}, AdHoP {'on' if summary.adhop else 'off'}, prior {summary.prior}, "
-                    f"seed {summary.seed}"),
+        (
+            "matcher",
+            f"{summary.matcher}, AdHoP {'on' if summary.adhop else 'off'}, prior {summary.prior}, seed {summary.seed}",
+        ),
         ("model", summary.model_sha256 or "none (no weights)"),
-        ("frames", f"{summary.frames}, of which fixes {summary.fixes} "
-                   f"(AdHoP gave the pose of {summary.adhop_accepted})"),
+        (
+            "frames",
+            f"{summary.frames}, of which fixes {summary.fixes} (AdHoP gave the pose of {summary.adhop_accepted})",
+        ),
         ("rejected", ", ".join(f"{reason} {count}" for reason, count in summary.rejected.items()) or "none"),
         ("recall", "  ".join(f"{name.replace('_', '-')} {100 * part:.1f} %" for name, part in summary.recall.items())),
         ("position error", spread(summary.te_m, "m")),
         ("rotation error", spread(summary.re_deg, "deg")),
         ("false fixes", str(summary.false_fixes)),
-        ("NEES", "-" if summary.nees.mean is None or summary.nees.p95 is None
-         else f"mean {summary.nees.mean:.1f}  p95 {summary.nees.p95:.1f}  (honest: mean {summary.nees.dof})"),
+        (
+            "NEES",
+            "-"
+            if summary.nees.mean is None or summary.nees.p95 is None
+            else f"mean {summary.nees.mean:.1f}  p95 {summary.nees.p95:.1f}  (honest: mean {summary.nees.dof})",
+        ),
     ]
     rows += [
-        (f"latency {stage}", f"median {l.median:.0f}  p95 {l.p95:.0f}  p99 {l.p99:.0f} ms")
-        for stage, l in summary.latency_ms.items()
+        (f"latency {stage}", f"median {spent.median:.0f}  p95 {spent.p95:.0f}  p99 {spent.p99:.0f} ms")
+        for stage, spent in summary.latency_ms.items()
     ]
     rows += [
         ("CPU per frame", f"{summary.cpu_ms_per_frame:.0f} ms"),

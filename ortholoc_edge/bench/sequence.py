@@ -132,7 +132,7 @@ def read_sample(path: Path) -> Sample:
 def _time(row: dict[str, str], where: str) -> datetime.datetime:
     text = row.get("exif_time", "")
     try:
-        return datetime.datetime.strptime(text, "%Y:%m:%d %H:%M:%S")  # noqa: DTZ007 - EXIF has no zone
+        return datetime.datetime.strptime(text, "%Y:%m:%d %H:%M:%S")
     except ValueError as err:
         raise DatasetError(f"{where}: exif_time {text!r} is not YYYY:MM:DD hh:mm:ss") from err
 

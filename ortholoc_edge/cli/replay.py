@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +26,7 @@ from ortholoc_edge.bench.replay import (
     replay_sample,
 )
 from ortholoc_edge.cli import matcher_options
+from ortholoc_edge.cli.arguments import length, triple
 from ortholoc_edge.errors import ConfigError, DatasetError, MapError
 from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.camera import Camera
@@ -54,27 +55,27 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument(
         "--attitude-sigma-deg",
-        type=_triple,
+        type=triple,
         default=(1.0, 1.0, 3.0),
         metavar="R,P,Y",
         help="1-sigma of roll, pitch, yaw (default: 1,1,3)",
     )
     parser.add_argument(
         "--position-sigma",
-        type=Length.parse,
+        type=length,
         default=Length(metres=2.0),
         metavar="LENGTH",
         help="horizontal 1-sigma per axis, of the first frame and of --prior gps and truth-noise: metres (5, 5m) or "
         "a part of the height above ground (4%%) (default: 2m)",
     )
     parser.add_argument(
-        "--height-sigma", type=Length.parse, default=Length(metres=2.0), metavar="LENGTH", help="vertical (default: 2m)"
+        "--height-sigma", type=length, default=Length(metres=2.0), metavar="LENGTH", help="vertical (default: 2m)"
     )
     parser.add_argument(
         "--odometer-error", type=float, default=2.0, metavar="PERCENT", help="of the distance (default: %(default)s)"
     )
     parser.add_argument(
-        "--odometer-drift", type=float, default=0.1, metavar="M_PER_S", help="over time (default: %(default)s)"
+        "--odometer-drift", type=float, default=0.05, metavar="M_PER_S", help="over time (default: %(default)s)"
     )
     parser.add_argument("--seed", type=int, default=0, help="of all noise (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
@@ -133,14 +134,6 @@ def run(args: argparse.Namespace) -> int:
         (args.out / "summary.json").write_bytes(encoded + b"\n")
     print(encoded.decode() if args.json else report.table(summary))
     return 0
-
-
-def _triple(text: str) -> tuple[float, float, float]:
-    try:
-        roll, pitch, yaw = (float(part) for part in text.split(","))
-    except ValueError as err:
-        raise argparse.ArgumentTypeError(f"{text!r} is not three numbers with commas") from err
-    return roll, pitch, yaw
 
 
 def _flight(

@@ -68,9 +68,7 @@ class Camera:
         """The camera of the image brought to another size; the field of view stays."""
         sx, sy = width / self.width, height / self.height
         cx, cy = resize_px((self.cx, self.cy), (sx, sy))
-        return replace(
-            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=float(cx), cy=float(cy)
-        )
+        return replace(self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=float(cx), cy=float(cy))
 
     def pinhole(self) -> Camera:
         """The same camera without distortion, for undistorted pixels."""

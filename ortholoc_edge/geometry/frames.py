@@ -24,6 +24,10 @@ ENU_FROM_NED.flags.writeable = False
 BODY_FROM_NADIR_CAMERA: FloatArray = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 BODY_FROM_NADIR_CAMERA.flags.writeable = False
 
+# A camera that looks along the nose with the top of its image up.
+BODY_FROM_FORWARD_CAMERA: FloatArray = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+BODY_FROM_FORWARD_CAMERA.flags.writeable = False
+
 # WGS 84 (EPSG:7030).
 _SEMI_MAJOR_M = 6378137.0
 _ECCENTRICITY_SQUARED = 0.0066943799901413165
@@ -31,9 +35,7 @@ _ECCENTRICITY_SQUARED = 0.0066943799901413165
 
 def map_from_ned_rotation(convergence_rad: float) -> FloatArray:
     """Rotation taking NED vectors (true north) to map axes (grid east, grid north, up)."""
-    return np.asarray(
-        ENU_FROM_NED @ rotation.from_euler(0.0, 0.0, -convergence_rad), dtype=np.float64
-    )
+    return np.asarray(ENU_FROM_NED @ rotation.from_euler(0.0, 0.0, -convergence_rad), dtype=np.float64)
 
 
 def ecef_from_geodetic(latitude_rad: float, longitude_rad: float, height_ellipsoid_m: float) -> FloatArray:

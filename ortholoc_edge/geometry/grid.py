@@ -76,9 +76,7 @@ class RasterGrid:
 
     def crop(self, column: int, row: int, width: int, height: int) -> RasterGrid:
         """Grid of the block of ``width`` x ``height`` pixels whose first pixel is (column, row) here."""
-        return RasterGrid(
-            width, height, self.west + self.dx * column, self.top + self.dy * row, self.dx, self.dy
-        )
+        return RasterGrid(width, height, self.west + self.dx * column, self.top + self.dy * row, self.dx, self.dy)
 
     def resized(self, width: int, height: int) -> RasterGrid:
         """The same extent in another number of pixels."""

@@ -41,9 +41,7 @@ class Rigid3:
 
     def __matmul__(self, other: Rigid3) -> Rigid3:
         """``a_from_b @ b_from_c`` is ``a_from_c``."""
-        return Rigid3(
-            self.rotation @ other.rotation, self.rotation @ other.translation + self.translation
-        )
+        return Rigid3(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
 
     def apply(self, points: npt.ArrayLike) -> FloatArray:
         """Points (..., 3) in b to points (..., 3) in a."""

@@ -37,7 +37,7 @@ def log(rotation: npt.ArrayLike) -> FloatArray:
     sin_half = float(np.linalg.norm(v))
     if sin_half < 1e-12:
         return 2.0 * v
-    return 2.0 * np.arctan2(sin_half, w) / sin_half * v
+    return np.asarray(2.0 * np.arctan2(sin_half, w) / sin_half * v, dtype=np.float64)
 
 
 def angle_between(a: npt.ArrayLike, b: npt.ArrayLike) -> float:

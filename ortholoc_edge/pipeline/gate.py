@@ -82,9 +82,7 @@ def enough_inliers(estimate: PoseEstimate, options: GateOptions) -> Refusal | No
         return Refusal(Reason.FEW_INLIERS, f"{count} of {total} matches", count, options.min_inliers)
     ratio = count / total
     if ratio < options.min_inlier_ratio:
-        return Refusal(
-            Reason.LOW_INLIER_RATIO, f"{count} of {total} matches", ratio, options.min_inlier_ratio
-        )
+        return Refusal(Reason.LOW_INLIER_RATIO, f"{count} of {total} matches", ratio, options.min_inlier_ratio)
     return None
 
 
@@ -108,9 +106,7 @@ def small_residual(estimate: PoseEstimate, max_error_px: float, options: GateOpt
 def above_ground(height_above_ground_m: float) -> Refusal | None:
     """A flat scene has a mirror solution below the ground."""
     if not height_above_ground_m > 0:
-        return Refusal(
-            Reason.DEGENERATE_GEOMETRY, "camera below the surface, m", height_above_ground_m, 0.0
-        )
+        return Refusal(Reason.DEGENERATE_GEOMETRY, "camera below the surface, m", height_above_ground_m, 0.0)
     return None
 
 
@@ -133,15 +129,11 @@ def agrees_with(
     tilt = float(np.sqrt(mahalanobis_squared(turn[:2], spread[3:5, 3:5])))
     if tilt > limit:
         degrees = float(np.degrees(np.linalg.norm(turn[:2])))
-        return Refusal(
-            Reason.GRAVITY_DISAGREES, f"{degrees:.1f} deg from the autopilot's, in sigmas", tilt, limit
-        )
+        return Refusal(Reason.GRAVITY_DISAGREES, f"{degrees:.1f} deg from the autopilot's, in sigmas", tilt, limit)
     heading = abs(float(turn[2])) / float(np.sqrt(spread[5, 5]))
     if heading > limit:
         degrees = float(np.degrees(abs(turn[2])))
-        return Refusal(
-            Reason.PRIOR_DISAGREES, f"heading {degrees:.1f} deg off, in sigmas", heading, limit
-        )
+        return Refusal(Reason.PRIOR_DISAGREES, f"heading {degrees:.1f} deg off, in sigmas", heading, limit)
     step = map_from_camera.translation - prior.map_from_camera.translation
     moved = float(np.sqrt(mahalanobis_squared(step, spread[:3, :3])))
     if moved > limit:

@@ -12,10 +12,10 @@ import numpy as np
 from msgspec import Meta, Struct, field
 
 from ortholoc_edge.errors import MapError
+from ortholoc_edge.geometry import homography
 from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.grid import resize_px
-from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.matching.adhop import fit_homography
 from ortholoc_edge.matching.types import Features, Matcher, Matches
 from ortholoc_edge.pipeline import gate, precondition
@@ -23,11 +23,13 @@ from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.precondition import ReferenceView
 from ortholoc_edge.pipeline.prior import (
+    MAX_HYPOTHESES,
     MAX_RANGE_HEIGHTS,
     Bounds,
     PosePrior,
     RegionPrior,
     footprint,
+    hypotheses,
     search_bounds,
 )
 from ortholoc_edge.pipeline.trace import Trace
@@ -41,9 +43,9 @@ from ortholoc_edge.tiles.window import MapWindow
 # Paper, "Initial Camera Calibration / Localization": matches below are dropped, where the matcher has one.
 MIN_CONFIDENCE = 0.5
 _MIN_MATCHES = 12
-# XFeat bears about 30 degrees of turn (matchers.md, "Rotation"); this covers twice the sigma in such steps.
-_HEADING_STEP_RAD = math.radians(30.0)
-_MAX_HEADING_STEPS = 6
+# Of a first round, to leave other hypotheses untried.
+_CONVINCING_INLIERS = 60
+_CONVINCING_RATIO = 0.35
 # A map picture finer than the frame is no use; a coarser one than this is hard to match (field-notes, scale).
 _MAX_COARSENING = 3.0
 _UNSTATED_SIGMA_PX = 0.5
@@ -72,9 +74,7 @@ class LocalizerOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 class _RejectedError(Exception):
     """Carries a rejection out of a stage to `Localizer.localize`, its only catcher."""
 
-    def __init__(
-        self, reason: Reason, detail: str, measured: float | None = None, limit: float | None = None
-    ) -> None:
+    def __init__(self, reason: Reason, detail: str, measured: float | None = None, limit: float | None = None) -> None:
         super().__init__(detail)
         self.reason, self.detail, self.measured, self.limit = reason, detail, measured, limit
 
@@ -96,6 +96,10 @@ class _Round:
     points_map: FloatArray
     estimate: pnp.PoseEstimate | None
     mean_error_px: float
+
+    @property
+    def inliers(self) -> int:
+        return 0 if self.estimate is None else int(np.count_nonzero(self.estimate.inliers))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,9 +147,7 @@ class Localizer:
         try:
             return self._localize(frame, prior, trace)
         except _RejectedError as stop:
-            return Rejected(
-                frame.stamp_ns, stop.reason, stop.detail, stop.measured, stop.limit, trace.timings_ms()
-            )
+            return Rejected(frame.stamp_ns, stop.reason, stop.detail, stop.measured, stop.limit, trace.timings_ms())
         except MapError as error:
             # One damaged tile must not end the flight: elsewhere the pack is good.
             return Rejected(frame.stamp_ns, Reason.MAP_DAMAGED, str(error), timings_ms=trace.timings_ms())
@@ -154,8 +156,7 @@ class Localizer:
         grey = self._checked_grey(frame)
         query = self._worker.submit(self._query_features, grey, trace)
         try:
-            scene = self._scene(prior, trace)
-            first = self._first_round(query, scene, trace)
+            scene, first = self._first_round(query, prior, trace)
             second = None
             if self._options.adhop:
                 with trace.stage("adhop"):
@@ -188,34 +189,35 @@ class Localizer:
 
     # -- where to look ---------------------------------------------------------------------------------
 
-    def _scene(self, prior: PosePrior | RegionPrior, trace: Trace) -> _Scene:
-        if isinstance(prior, RegionPrior):
-            return self._scene_of_region(prior, trace)
+    def _hypotheses(self, prior: PosePrior) -> list[PosePrior]:
+        _, outline = self._predicted_ground(prior)
+        footprint_m = float(np.ptp(outline, axis=0).min())
+        found = hypotheses(prior, footprint_m)
+        if len(found) > MAX_HYPOTHESES:
+            raise _RejectedError(
+                Reason.PRIOR_TOO_WIDE,
+                f"heading within {math.degrees(prior.heading_sigma_rad):.0f} deg and position within "
+                f"{prior.position_sigma_m:.0f} m (1 sigma), of views {footprint_m:.0f} m wide: too many to try",
+                len(found),
+                MAX_HYPOTHESES,
+            )
+        return found
+
+    def _scene_of_pose(self, prior: PosePrior, trace: Trace) -> _Scene:
         with trace.stage("map_window"):
             ground_m, outline = self._predicted_ground(prior)
-            distance_m = self._distance_to_ground(prior, ground_m)
-            gsd_m = distance_m / self._working.focal_px
+            gsd_m = self._distance_to_ground(prior, ground_m) / self._working.focal_px
             window = self._read(search_bounds(outline, prior, self._options.search_sigmas), gsd_m)
             dop_grey = precondition.grey_map(window)
         with trace.stage("view"):
             local = self._local_frame(window, ground_m)
             plane = precondition.ground_plane(window, local, outline)
             if plane is None:
-                raise _RejectedError(
-                    Reason.MAP_NODATA, "the surface model has no data under the predicted view"
-                )
-            error_m = math.hypot(prior.position_sigma_m, distance_m * prior.tilt_sigma_rad)
-            # An error of a tenth of the picture costs overlap that can be spared; beyond it, look wider.
-            widening = 1.5 * error_m / (gsd_m * self._working.width) - 0.1
-            views = [
-                precondition.predicted_view(
-                    window, dop_grey, local, plane, self._working, prior, offset_rad, widening
-                )
-                for offset_rad in _heading_offsets(prior.heading_sigma_rad)
-            ]
-            if not any(view.valid.any() for view in views):
+                raise _RejectedError(Reason.MAP_NODATA, "the surface model has no data under the predicted view")
+            view = precondition.predicted_view(window, dop_grey, local, plane, self._working, prior)
+            if not view.valid.any():
                 raise _RejectedError(Reason.MAP_NODATA, "the orthophoto has no data in the predicted view")
-        return _Scene(window, dop_grey, local, ground_m, views)
+        return _Scene(window, dop_grey, local, ground_m, [view])
 
     def _scene_of_region(self, prior: RegionPrior, trace: Trace) -> _Scene:
         with trace.stage("map_window"):
@@ -253,8 +255,7 @@ class Localizer:
             if height_m <= 0:
                 raise _RejectedError(
                     Reason.PRIOR_DISAGREES,
-                    "the predicted camera lies below the surface model; check the vertical datum of pack and "
-                    "autopilot",
+                    "the predicted camera lies below the surface model; check the vertical datum of pack and autopilot",
                     height_m,
                     0.0,
                 )
@@ -294,14 +295,37 @@ class Localizer:
 
     def _local_frame(self, window: MapWindow, ground_m: float) -> LocalFrame:
         west, south, east, north = window.dop_grid.bounds
-        return self._store.pack.georeference.local_frame(
-            ((west + east) / 2, (south + north) / 2), ground_m
-        )
+        return self._store.pack.georeference.local_frame(((west + east) / 2, (south + north) / 2), ground_m)
 
     # -- matching and pose -----------------------------------------------------------------------------
 
-    def _first_round(self, query: Future[Features], scene: _Scene, trace: Trace) -> _Round:
-        """The hypothesis with the most matches (paper: "selecting the one with most correspondences")."""
+    def _first_round(
+        self, query: Future[Features], prior: PosePrior | RegionPrior, trace: Trace
+    ) -> tuple[_Scene, _Round]:
+        """The best of what there is to try; the first that convinces ends the search."""
+        if isinstance(prior, RegionPrior):
+            scene = self._scene_of_region(prior, trace)
+            return scene, self._round(query, scene, trace)
+        best: tuple[_Scene, _Round] | None = None
+        refused: _RejectedError | None = None
+        for hypothesis in self._hypotheses(prior):
+            try:
+                scene = self._scene_of_pose(hypothesis, trace)
+            except _RejectedError as error:
+                refused = refused or error
+                continue
+            found = self._round(query, scene, trace)
+            if best is None or found.inliers > best[1].inliers:
+                best = scene, found
+            if found.inliers >= _CONVINCING_INLIERS and found.inliers >= _CONVINCING_RATIO * len(found.kept):
+                break
+        if best is None:
+            raise refused or _RejectedError(Reason.NO_PRIOR, "nothing to look at")
+        return best
+
+    def _round(self, query: Future[Features], scene: _Scene, trace: Trace) -> _Round:
+        """Match all pictures of a scene and solve the one with the most matches (paper: "selecting the one
+        with most correspondences")."""
         best: tuple[Matches, ReferenceView] | None = None
         for view in scene.views:
             with trace.stage("map_features"):
@@ -310,11 +334,19 @@ class Localizer:
             with trace.stage("match"):
                 matches = self.matcher.match(query_features, features)
             if best is None or len(matches) > len(best[0]):
-                best = (matches, view)
-        if best is None:
-            raise _RejectedError(Reason.NO_PRIOR, "no hypothesis to look at")
+                best = matches, view
+        assert best is not None, "a scene has at least one view"
         with trace.stage("pose"):
             return self._solved(*best, scene)
+
+    def _near_prediction(self, matches: Matches, predicted: ReferenceView) -> Matches:
+        """Without the matches (frame and DOP pixels) that the prior rules out: they would only outvote others."""
+        if math.isinf(predicted.max_shift_px):
+            return matches
+        scale = self._working.width / self.camera.width, self._working.height / self.camera.height
+        expected = homography.warp_points(predicted.view_from_dop, matches.map_px) - predicted.margin_px
+        shift = np.linalg.norm(resize_px(matches.query_px, scale) - expected, axis=1)
+        return matches.take(np.flatnonzero(shift <= predicted.max_shift_px))
 
     def _adhop(self, first: _Round, query: Features, scene: _Scene) -> _Round | None:
         """The paper's refinement: None unless the second round's mean reprojection error is smaller."""
@@ -345,10 +377,9 @@ class Localizer:
         if matches.confidence is not None:
             on_frame &= matches.confidence >= MIN_CONFIDENCE
         matches = matches.take(np.flatnonzero(on_frame))
-        matches = Matches(
-            self.camera.undistorted_px(matches.query_px), view.dop_px(matches.map_px), matches.confidence
-        )
+        matches = Matches(self.camera.undistorted_px(matches.query_px), view.dop_px(matches.map_px), matches.confidence)
         matches = matches.take(np.flatnonzero(np.isfinite(matches.map_px).all(axis=1)))
+        matches = self._near_prediction(matches, scene.views[0])
         lifted = lift(matches.map_px, scene.window)
         estimate = None
         if len(lifted.kept) >= _MIN_MATCHES:
@@ -368,9 +399,7 @@ class Localizer:
 
     # -- judgement -------------------------------------------------------------------------------------
 
-    def _fix(
-        self, frame: Frame, chosen: _Round, scene: _Scene, prior: PosePrior | RegionPrior
-    ) -> Fix:
+    def _fix(self, frame: Frame, chosen: _Round, scene: _Scene, prior: PosePrior | RegionPrior) -> Fix:
         estimate = chosen.estimate
         if len(chosen.kept) < _MIN_MATCHES:
             raise _RejectedError(
@@ -434,11 +463,3 @@ def _map_covariance(manifest: Manifest) -> FloatArray:
     vertical_m = _UNSTATED_SIGMA_PX * manifest.dsm.gsd_m if manifest.dsm.sigma_m is None else manifest.dsm.sigma_m
     vertical_m = math.hypot(vertical_m, manifest.dsm.max_z_error_m)
     return np.diag(np.square([planimetric_m, planimetric_m, vertical_m, 0.0, 0.0, 0.0]))
-
-
-def _heading_offsets(heading_sigma_rad: float) -> list[float]:
-    """Headings to try: the predicted one, and where it is poorly known, steps to both sides."""
-    steps = min(round(2.0 * heading_sigma_rad / _HEADING_STEP_RAD - 0.5), _MAX_HEADING_STEPS)
-    if steps >= _MAX_HEADING_STEPS:
-        return [_HEADING_STEP_RAD * k for k in range(2 * _MAX_HEADING_STEPS)]
-    return [0.0, *(sign * _HEADING_STEP_RAD * k for k in range(1, steps + 1) for sign in (1, -1))]

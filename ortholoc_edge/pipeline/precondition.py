@@ -7,12 +7,13 @@ shown in four quarter turns, as the paper does for matchers that are not invaria
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from ortholoc_edge.geometry import homography, rotation
+from ortholoc_edge.geometry import homography
 from ortholoc_edge.geometry.arrays import BoolArray, FloatArray, ImageArray
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.rigid import Rigid3
@@ -24,6 +25,8 @@ from ortholoc_edge.tiles.window import MapWindow
 _PLANE_SAMPLES = 24
 # A widened view shrinks in the matcher; XFeat bears a factor of two (matchers.md, "Rotation" and "Scale").
 _MAX_WIDENING = 0.5
+# Of matching and of the surface model, beyond what the prior explains.
+_SHIFT_FLOOR_PX = 8.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,15 +37,20 @@ class ReferenceView:
         image: (H, W) uint8 grey.
         valid: (H, W) bool, False where it shows no map.
         view_from_dop: (3, 3) homography from the window's DOP pixels to this picture's.
+        margin_px: of a predicted view, by which it shows more than the camera on every side.
+        max_shift_px: of a predicted view, how far from where it is predicted a thing may lie in the frame, both
+            at the working size; infinite where nothing is predicted.
     """
 
     image: ImageArray
     valid: BoolArray
     view_from_dop: FloatArray
+    margin_px: int = 0
+    max_shift_px: float = math.inf
 
     def dop_px(self, view_px: FloatArray) -> FloatArray:
         """DOP pixels (N, 2) of pixels of this picture; AdHoP's inverse mapping."""
-        inverse = np.linalg.inv(self.view_from_dop)
+        inverse: FloatArray = np.asarray(np.linalg.inv(self.view_from_dop), dtype=np.float64)
         # The sign of a homography is free; here it makes what the picture shows positive.
         centre = (np.array(self.image.shape[::-1]) - 1) / 2
         return homography.warp_points(homography.positive_at(inverse, centre), view_px)
@@ -53,7 +61,9 @@ def grey_map(window: MapWindow) -> ImageArray:
     return np.asarray(cv2.cvtColor(window.dop, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
-def warped(dop_grey: ImageArray, dop_valid: BoolArray, view_from_dop: FloatArray, width: int, height: int) -> ReferenceView:
+def warped(
+    dop_grey: ImageArray, dop_valid: BoolArray, view_from_dop: FloatArray, width: int, height: int
+) -> ReferenceView:
     """The orthophoto through a homography, and where that shows map."""
     size = (width, height)
     image = cv2.warpPerspective(dop_grey, view_from_dop, size, flags=cv2.INTER_LINEAR)
@@ -61,19 +71,30 @@ def warped(dop_grey: ImageArray, dop_valid: BoolArray, view_from_dop: FloatArray
     return ReferenceView(np.asarray(image, dtype=np.uint8), valid.astype(bool), view_from_dop)
 
 
-def ground_plane(window: MapWindow, local: LocalFrame, outline_map: FloatArray) -> FloatArray | None:
+@dataclass(frozen=True, slots=True, eq=False)
+class GroundPlane:
     """The plane ``z = a + b x + c y`` (local metres) that fits the surface under a footprint best.
+
+    Attributes:
+        abc: (3,).
+        relief_m: 95th percentile of the surface's distance from it.
+    """
+
+    abc: FloatArray
+    relief_m: float
+
+
+def ground_plane(window: MapWindow, local: LocalFrame, outline_map: FloatArray) -> GroundPlane | None:
+    """The plane through the surface model under a footprint.
 
     Twice re-weighted by the median residual, so that roofs and trees bend it little.
 
     Args:
         outline_map: (K, 2) points that span the footprint.
-    Returns: (3,) a, b, c; None where the surface model has no data.
+    Returns: None where the surface model has no data.
     """
     low, high = outline_map.min(axis=0), outline_map.max(axis=0)
-    x, y = np.meshgrid(
-        np.linspace(low[0], high[0], _PLANE_SAMPLES), np.linspace(low[1], high[1], _PLANE_SAMPLES)
-    )
+    x, y = np.meshgrid(np.linspace(low[0], high[0], _PLANE_SAMPLES), np.linspace(low[1], high[1], _PLANE_SAMPLES))
     xy_map = np.column_stack([x.ravel(), y.ravel()])
     heights = bilinear(window.dsm, window.dsm_grid.px_from_map(xy_map))
     known = np.isfinite(heights)
@@ -82,22 +103,22 @@ def ground_plane(window: MapWindow, local: LocalFrame, outline_map: FloatArray) 
     points = local.local_from_map(np.column_stack([xy_map[known], heights[known]]))
     centre = points.mean(axis=0)
     design = np.column_stack([np.ones(len(points)), points[:, :2] - centre[:2]])
+    plane = np.array([float(np.median(points[:, 2])), 0.0, 0.0])
+    residuals = np.abs(points[:, 2] - plane[0])
     weights = np.ones(len(points))
-    level = np.array([float(np.median(points[:, 2])), 0.0, 0.0])
-    if len(points) < _PLANE_SAMPLES:
-        # Too little of the surface is known to tell its slope.
-        return level
-    plane = level
-    for _ in range(3):
+    # Where little of the surface is known, its slope is not: then the plane stays level.
+    for _ in range(3 if len(points) >= _PLANE_SAMPLES else 0):
         root = np.sqrt(weights)
         plane, *_ = np.linalg.lstsq(design * root[:, None], points[:, 2] * root, rcond=None)
         residuals = np.abs(points[:, 2] - design @ plane)
         weights = 1.0 / np.maximum(residuals, max(float(np.median(residuals)), 0.05))
     a = plane[0] - plane[1] * centre[0] - plane[2] * centre[1]
-    return np.array([a, plane[1], plane[2]])
+    return GroundPlane(np.array([a, plane[1], plane[2]]), float(np.percentile(residuals, 95)))
 
 
-def view_homography(window: MapWindow, local: LocalFrame, plane: FloatArray, camera: Camera, local_from_camera: Rigid3) -> FloatArray:
+def view_homography(
+    window: MapWindow, local: LocalFrame, plane: FloatArray, camera: Camera, local_from_camera: Rigid3
+) -> FloatArray:
     """(3, 3) from DOP pixels to pixels of a pinhole camera, for ground on a plane ``z = a + b x + c y``."""
     grid = window.dop_grid.map_from_px_matrix()
     shrink = 1.0 / local.grid_scale
@@ -118,28 +139,43 @@ def predicted_view(
     window: MapWindow,
     dop_grey: ImageArray,
     local: LocalFrame,
-    plane: FloatArray,
+    plane: GroundPlane,
     camera: Camera,
     prior: PosePrior,
-    heading_offset_rad: float,
-    widening: float,
 ) -> ReferenceView:
-    """The orthophoto as the camera should see it.
+    """The orthophoto as the camera should see it, and somewhat more where the prediction is uncertain.
 
     Args:
         camera: pinhole at the working size.
-        heading_offset_rad: added to the prior's heading (clockwise), for priors that hardly know it.
-        widening: part of the long side by which the view shows more on every side.
     """
+    local_from_camera = local.local_from_map_pose(prior.map_from_camera)
+    shift_px = _predicted_shift(camera, local_from_camera, plane, prior)
+    # A shift of a tenth of the picture costs overlap that can be spared; beyond it, look wider.
+    widening = 0.5 * shift_px / camera.width - 0.1
     margin = round(min(max(widening, 0.0), _MAX_WIDENING) * max(camera.width, camera.height))
-    camera = camera.padded(margin)
-    predicted = local.local_from_map_pose(prior.map_from_camera)
-    turned = rotation.exp([0.0, 0.0, -heading_offset_rad]) @ predicted.rotation
-    local_from_camera = Rigid3(turned, predicted.translation)
-    matrix = view_homography(window, local, plane, camera, local_from_camera)
-    view = warped(dop_grey, window.dop_valid, matrix, camera.width, camera.height)
-    ahead = _sees_ground(camera, local_from_camera, plane)
-    return view if ahead is None else ReferenceView(view.image, view.valid & ahead, matrix)
+    wide = camera.padded(margin)
+    matrix = view_homography(window, local, plane.abc, wide, local_from_camera)
+    view = warped(dop_grey, window.dop_valid, matrix, wide.width, wide.height)
+    ahead = _sees_ground(wide, local_from_camera, plane.abc)
+    return replace(
+        view,
+        valid=view.valid if ahead is None else view.valid & ahead,
+        margin_px=margin,
+        max_shift_px=shift_px + _SHIFT_FLOOR_PX,
+    )
+
+
+def _predicted_shift(camera: Camera, local_from_camera: Rigid3, plane: GroundPlane, prior: PosePrior) -> float:
+    """Three sigmas of how far in the picture, px, the prior's errors and the relief move things."""
+    axis = local_from_camera.rotation[:, 2]
+    below_m = float(plane.abc @ np.append(1.0, local_from_camera.translation[:2]))
+    height_m = max(float(local_from_camera.translation[2]) - below_m, 1e-3)
+    distance_m = height_m / max(-float(axis[2]), 1.0 / MAX_RANGE_HEIGHTS)
+    radius_px = 0.5 * math.hypot(camera.width, camera.height)
+    sideways = math.hypot(camera.focal_px * prior.position_sigma_m / distance_m, camera.focal_px * prior.tilt_sigma_rad)
+    turn = radius_px * prior.heading_sigma_rad
+    zoom = radius_px * prior.height_sigma_m / height_m
+    return float(3.0 * math.hypot(sideways, turn, zoom) + radius_px * plane.relief_m / height_m)
 
 
 def _sees_ground(camera: Camera, local_from_camera: Rigid3, plane: FloatArray) -> BoolArray | None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import FloatArray, frozen_floats
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.rigid import Rigid3
@@ -16,6 +17,14 @@ Bounds = tuple[float, float, float, float]
 # (field-notes "Oblique views": mask what is beyond ten times the ground sampling distance at nadir).
 MAX_RANGE_HEIGHTS = 8.0
 _SAMPLES_PER_SIDE = 5
+# XFeat bears about 30 degrees of turn (matchers.md, "Rotation").
+_HEADING_STEP_RAD = np.pi / 6
+_WHOLE_CIRCLE = 12
+# Two sigmas of the position, as a part of the footprint, that one widened view covers; and the grid beyond.
+_SHIFT_OF_FOOTPRINT = 0.6
+_STEP_OF_FOOTPRINT = 0.6
+# Each costs a network pass; more is area search, not tracking.
+MAX_HYPOTHESES = 40
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,3 +102,63 @@ def search_bounds(points_map: FloatArray, prior: PosePrior, sigmas: float) -> Bo
     west, south = points_map.min(axis=0) - margin
     east, north = points_map.max(axis=0) + margin
     return float(west), float(south), float(east), float(north)
+
+
+def hypotheses(prior: PosePrior, footprint_m: float) -> list[PosePrior]:
+    """Narrower priors that together cover a wide one, the likeliest first.
+
+    A matcher bears a shift of about half the picture and a turn of about 30 degrees; a prior within that is its
+    own single hypothesis.
+
+    Args:
+        footprint_m: the short side of what the camera sees.
+    """
+    headings = _heading_steps(prior.heading_sigma_rad)
+    offsets = _position_steps(prior, footprint_m)
+    if len(headings) == 1 and len(offsets) == 1:
+        return [prior]
+    covariance = prior.covariance.copy()
+    if len(offsets) > 1:
+        covariance[:2, :2] = np.eye(2) * (_STEP_OF_FOOTPRINT * footprint_m / 2.0) ** 2
+        covariance[:2, 2:] = covariance[2:, :2] = 0.0
+    if len(headings) > 1:
+        covariance[5, :5] = covariance[:5, 5] = 0.0
+        covariance[5, 5] = (_HEADING_STEP_RAD / 2.0) ** 2
+    pose = prior.map_from_camera
+    return [
+        PosePrior(
+            Rigid3(rotation.exp([0.0, 0.0, turn]) @ pose.rotation, pose.translation + np.append(offset, 0.0)),
+            covariance,
+        )
+        for offset in offsets
+        for turn in headings
+    ]
+
+
+def _heading_steps(sigma_rad: float) -> list[float]:
+    """Turns about the vertical that cover two sigmas, or the whole circle; the smallest first."""
+    count = round(2.0 * sigma_rad / _HEADING_STEP_RAD - 0.5)
+    if count >= _WHOLE_CIRCLE // 2:
+        return sorted((_HEADING_STEP_RAD * k for k in range(1 - _WHOLE_CIRCLE // 2, _WHOLE_CIRCLE // 2 + 1)), key=abs)
+    return sorted((_HEADING_STEP_RAD * k for k in range(-count, count + 1)), key=abs)
+
+
+def _position_steps(prior: PosePrior, footprint_m: float) -> list[FloatArray]:
+    """Horizontal offsets (2,) on a grid over the prior's two-sigma ellipse, nearest in sigmas first."""
+    if 2.0 * prior.position_sigma_m <= _SHIFT_OF_FOOTPRINT * footprint_m:
+        return [np.zeros(2)]
+    step = _STEP_OF_FOOTPRINT * footprint_m
+    reach = int(np.ceil(2.0 * prior.position_sigma_m / step))
+    if (2 * reach + 1) ** 2 > MAX_HYPOTHESES * 4:
+        return [np.zeros(2)] * (MAX_HYPOTHESES + 1)
+    inverse = np.linalg.inv(prior.covariance[:2, :2])
+    found = []
+    for east in range(-reach, reach + 1):
+        for north in range(-reach, reach + 1):
+            offset = np.array([east * step, north * step])
+            # A cell counts if it comes within two sigmas.
+            near = offset * max(0.0, 1.0 - 0.5 * step / max(float(np.linalg.norm(offset)), 1e-9))
+            squared = float(near @ inverse @ near)
+            if squared <= 4.0:
+                found.append((squared, east, north, offset))
+    return [entry[3] for entry in sorted(found, key=lambda entry: entry[:3])]

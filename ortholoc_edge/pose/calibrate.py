@@ -39,9 +39,7 @@ def solve(
     start = pnp.solve(points_local, query_px, camera, max_error_px=loose_px, seed=seed)
     if start is None:
         return None
-    joint = pnp.refine(
-        points_local, query_px, camera, start.local_from_camera, max_error_px=loose_px, free_focal=True
-    )
+    joint = pnp.refine(points_local, query_px, camera, start.local_from_camera, max_error_px=loose_px, free_focal=True)
     if joint is None:
         return None
     # Once the focal length is about right the true inliers can be told with the strict threshold.

@@ -1,0 +1,170 @@
+"""The daemon's configuration: TOML to checked values. Wrong keys and values are named with their path."""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta, Struct, field
+
+from ortholoc_edge.adapters.bus import BusOptions
+from ortholoc_edge.adapters.camera import CameraOptions
+from ortholoc_edge.adapters.mavlink import LinkOptions
+from ortholoc_edge.errors import ConfigError
+from ortholoc_edge.geometry import frames, rotation
+from ortholoc_edge.geometry.arrays import FloatArray
+from ortholoc_edge.geometry.camera import Camera
+from ortholoc_edge.geometry.rigid import Rigid3
+from ortholoc_edge.pipeline.localizer import LocalizerOptions
+from ortholoc_edge.pipeline.tracker import TrackerOptions
+
+
+class Intrinsics(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A pinhole camera with OpenCV's distortion (k1, k2, p1, p2, k3); pixel centres at integers."""
+
+    width_px: Annotated[int, Meta(ge=16)]
+    height_px: Annotated[int, Meta(ge=16)]
+    fx: Annotated[float, Meta(gt=0)]
+    fy: Annotated[float, Meta(gt=0)]
+    cx: float
+    cy: float
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def camera(self) -> Camera:
+        return Camera(self.width_px, self.height_px, self.fx, self.fy, self.cx, self.cy, self.distortion)
+
+
+class MountOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How the camera sits on the vehicle.
+
+    Attributes:
+        preset: "nadir-nose-up": straight down, image top toward the nose; "forward": along the nose, level.
+        roll_deg, pitch_deg, yaw_deg: the mount is turned by these from the preset, about the body's axes, as
+            ZYX angles. A camera that looks forward and down by 60 degrees is "forward" with pitch_deg = -60.
+        lever_arm_m: of the camera from the body's reference point: forward, right, down.
+    """
+
+    preset: Literal["nadir-nose-up", "forward"] = "nadir-nose-up"
+    roll_deg: float = 0.0
+    pitch_deg: float = 0.0
+    yaw_deg: float = 0.0
+    lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def body_from_camera(self) -> Rigid3:
+        preset = frames.BODY_FROM_NADIR_CAMERA if self.preset == "nadir-nose-up" else frames.BODY_FROM_FORWARD_CAMERA
+        turn = rotation.from_euler(
+            math.radians(self.roll_deg), math.radians(self.pitch_deg), math.radians(self.yaw_deg)
+        )
+        return Rigid3(turn @ preset, np.array(self.lever_arm_m))
+
+
+class MapOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Which area pack, and how much memory its decoded tiles may take.
+
+    ``tolerate_damage``: fly with a pack that has damaged tiles; frames over one give no fix.
+    """
+
+    pack: str
+    cache_mb: Annotated[int, Meta(ge=1)] = 64
+    tolerate_damage: bool = False
+
+
+class MatcherOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Which matcher. ``model``: a file instead of the built one; ``model_sha256``: what it must hash to.
+
+    ``working_px``: long side at which frames are matched: time grows with its square.
+    """
+
+    name: str = "xfeat"
+    working_px: Annotated[int, Meta(ge=128, le=4096)] = 640
+    threads: Annotated[int, Meta(ge=1, le=64)] = 1
+    model: str | None = None
+    model_sha256: str | None = None
+
+
+class AttitudeOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How well the autopilot knows its attitude: 1-sigma of roll, pitch, yaw in degrees, mount included."""
+
+    sigma_deg: tuple[Annotated[float, Meta(gt=0)], Annotated[float, Meta(gt=0)], Annotated[float, Meta(gt=0)]] = (
+        1.0,
+        1.0,
+        3.0,
+    )
+
+
+class LogOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Where every outcome is written as a line of JSON; nowhere if ``folder`` is left out."""
+
+    folder: str | None = None
+    max_mb: Annotated[int, Meta(ge=1)] = 256
+
+
+class Config(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The whole file; tables are described at their classes and in config/example.toml."""
+
+    camera: CameraOptions
+    intrinsics: Intrinsics
+    map: MapOptions
+    link: LinkOptions
+    mount: MountOptions = field(default_factory=MountOptions)
+    matcher: MatcherOptions = field(default_factory=MatcherOptions)
+    localizer: LocalizerOptions = field(default_factory=LocalizerOptions)
+    tracker: TrackerOptions = field(default_factory=TrackerOptions)
+    attitude: AttitudeOptions = field(default_factory=AttitudeOptions)
+    log: LogOptions = field(default_factory=LogOptions)
+    bus: BusOptions = field(default_factory=BusOptions)
+
+
+def read_config(path: Path) -> Config:
+    """Parse and check a configuration file.
+
+    Raises: ConfigError naming the file and the key.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as err:
+        raise ConfigError(f"{path}: can't be read ({err})") from err
+    try:
+        return msgspec.convert(tomllib.loads(text), Config)
+    except tomllib.TOMLDecodeError as err:
+        raise ConfigError(f"{path}: not TOML: {err}") from err
+    except msgspec.ValidationError as err:
+        raise ConfigError(f"{path}: {err}; see config/example.toml for what is allowed") from err
+
+
+def read_intrinsics(path: Path, width: int, height: int) -> Camera:
+    """Intrinsics from JSON, for an image of a given size.
+
+    Either our own keys (`Intrinsics`; another size of the same aspect is scaled) or ``{"intrinsics": 3x3}`` as
+    OrthoLoC's files have it, which belongs to the image as it is.
+    Raises: ConfigError naming the file and the key.
+    """
+    try:
+        raw = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as err:
+        raise ConfigError(f"{path}: can't be read as JSON ({err})") from err
+    try:
+        if isinstance(raw, dict) and "intrinsics" in raw:
+            matrix: FloatArray = np.array(raw["intrinsics"], dtype=np.float64)
+            if matrix.shape != (3, 3):
+                raise ConfigError(f"{path}: intrinsics is {matrix.shape}, expected 3 x 3")
+            return Camera(width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+        given = msgspec.convert(raw, Intrinsics).camera()
+    except (msgspec.ValidationError, ValueError, TypeError) as err:
+        raise ConfigError(
+            f"{path}: {err}; expected width_px, height_px, fx, fy, cx, cy and optionally distortion, "
+            'or {"intrinsics": 3x3}'
+        ) from err
+    if (given.width, given.height) == (width, height):
+        return given
+    if abs(given.width * height - given.height * width) > max(width, height):
+        raise ConfigError(
+            f"{path}: intrinsics are for {given.width} x {given.height} px, the image has {width} x {height}: "
+            "another aspect; crop the image as it was calibrated"
+        )
+    return given.resized(width, height)

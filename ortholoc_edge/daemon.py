@@ -1,0 +1,367 @@
+"""The program that flies: threads, hand-overs, supervision, shutdown.
+
+    capture thread ──LatestSlot──▶ worker (the caller's thread): state at exposure → Navigator.step → estimate
+    link thread    ◀──────────── estimates, status      recorder and bus: bounded, drop and count
+
+Frames never queue: a position three frames old misleads by an amount that nobody sees.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from ortholoc_edge.adapters import systemd
+from ortholoc_edge.adapters.bus import Bus
+from ortholoc_edge.adapters.camera import BadFrameError, EndOfFrames, FrameSource, open_source
+from ortholoc_edge.adapters.estimates import (
+    EarthModel,
+    GeodeticOrigin,
+    VisionEstimate,
+    earth_model,
+    ned_from_geodetic,
+)
+from ortholoc_edge.adapters.mavlink import AutopilotLink, AutopilotState, Severity, SystemStatus
+from ortholoc_edge.adapters.recorder import Recorder
+from ortholoc_edge.clock import Clock, SystemClock
+from ortholoc_edge.config import Config
+from ortholoc_edge.errors import CameraError, LinkError, MapError, OrtholocError
+from ortholoc_edge.geometry import covariance as cov
+from ortholoc_edge.geometry import frames
+from ortholoc_edge.geometry.arrays import FloatArray
+from ortholoc_edge.geometry.rigid import Rigid3
+from ortholoc_edge.matching.registry import make_matcher
+from ortholoc_edge.matching.types import Matcher
+from ortholoc_edge.pipeline.frame import Frame, VehicleState
+from ortholoc_edge.pipeline.localizer import Localizer
+from ortholoc_edge.pipeline.navigator import Navigator
+from ortholoc_edge.pipeline.odometry import VelocityOdometry
+from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
+from ortholoc_edge.pipeline.tracker import Tracker, TrackerStatus
+from ortholoc_edge.tiles.georeference import Georeference
+from ortholoc_edge.tiles.pack import Pack
+from ortholoc_edge.tiles.store import MapStore
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+_WAIT_S = 0.2
+# The autopilot's attitude for an exposure arrives after it; the frame waits this long for it at most.
+_STATE_WAIT_S = 0.15
+_MAX_ERRORS_IN_A_ROW = 5
+_STATUS_INTERVAL_NS = 5_000_000_000
+
+OutcomeListener = Callable[[Frame | None, Outcome], None]
+
+
+class LatestSlot(Generic[T]):
+    """Holds one item. ``put`` replaces what was not taken, and counts it."""
+
+    def __init__(self) -> None:
+        self._condition = threading.Condition()
+        self._item: T | None = None
+        self.replaced = 0
+
+    def put(self, item: T) -> None:
+        with self._condition:
+            if self._item is not None:
+                self.replaced += 1
+            self._item = item
+            self._condition.notify()
+
+    def take(self, timeout_s: float) -> T | None:
+        """The item, or None if none came in time."""
+        with self._condition:
+            if self._item is None:
+                self._condition.wait(timeout_s)
+            item, self._item = self._item, None
+            return item
+
+
+@dataclass(frozen=True, slots=True)
+class _Missed:
+    """A frame that could not be read."""
+
+    stamp_ns: int
+    why: str
+
+
+class Daemon:
+    """Camera, map, matcher and autopilot, wired up.
+
+    Raises on construction: OrtholocError for what can't work (map, model, endpoint), before anything starts.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        *,
+        frames: FrameSource | None = None,
+        matcher: Matcher | None = None,
+        clock: Clock | None = None,
+        on_outcome: OutcomeListener | None = None,
+    ) -> None:
+        """
+        Args:
+            frames: instead of ``config.camera``.
+            matcher: instead of ``config.matcher``.
+            on_outcome: told of every outcome, in the worker's thread; must return at once.
+        """
+        self._config = config
+        self._clock = clock or SystemClock()
+        self._on_outcome = on_outcome
+        self._store = MapStore(
+            Pack.open(Path(config.map.pack)),
+            cache_bytes=config.map.cache_mb * 2**20,
+            tolerate_damage=config.map.tolerate_damage,
+        )
+        self._georeference = self._store.pack.georeference
+        _require_flyable(self._georeference, config.map.pack)
+        options = config.matcher
+        self._matcher = matcher or make_matcher(
+            options.name,
+            working_px=options.working_px,
+            threads=options.threads,
+            model_path=None if options.model is None else Path(options.model),
+            model_sha256=options.model_sha256,
+        )
+        self._body_from_camera = config.mount.body_from_camera()
+        localizer = Localizer(config.intrinsics.camera(), self._store, self._matcher, config.localizer)
+        self._navigator = Navigator(localizer, Tracker(self._georeference, self._body_from_camera, config.tracker))
+        self._odometry = VelocityOdometry()
+        self._link = AutopilotLink(config.link, self._clock)
+        self._frames = frames or open_source(config.camera, self._clock)
+        self._recorder = Recorder(Path(config.log.folder), config.log.max_mb) if config.log.folder else None
+        self._bus = Bus(config.bus) if config.bus.enabled else None
+        self._slot: LatestSlot[Frame | _Missed] = LatestSlot()
+        self._ended = threading.Event()
+        self._capture_failure: BaseException | None = None
+        self._counts = {"fixes": 0, "rejected": 0, "no_origin": 0}
+        self._last_status_ns = 0
+
+    @property
+    def link(self) -> AutopilotLink:
+        return self._link
+
+    def statistics(self) -> dict[str, int]:
+        """Counters since the start."""
+        return {**self._counts, "frames_replaced": self._slot.replaced}
+
+    def run(self, stop: threading.Event) -> None:
+        """Work until ``stop`` is set or the frames end.
+
+        Raises: OrtholocError where a part failed for good; systemd then starts afresh.
+        """
+        self._warm_up()
+        capture = threading.Thread(target=self._capture, args=(stop,), name="capture", daemon=True)
+        self._link.set_system_status(SystemStatus.STANDBY)
+        self._link.start()
+        capture.start()
+        systemd.notify("READY=1")
+        logger.info("running: pack %s, matcher %s", self._config.map.pack, self._matcher.name)
+        try:
+            self._work(stop)
+        finally:
+            systemd.notify("STOPPING=1")
+            stop.set()
+            self._frames.close()
+            capture.join(timeout=5.0)
+            self._link.stop()
+            if self._recorder is not None:
+                self._recorder.close()
+            if self._bus is not None:
+                self._bus.close()
+            self._navigator.localizer.close()
+            self._store.close()
+            logger.info("stopped: %s", self.statistics())
+        if self._capture_failure is not None:
+            raise CameraError(f"the camera thread ended: {self._capture_failure}") from self._capture_failure
+
+    # -- threads ---------------------------------------------------------------------------------------
+
+    def _capture(self, stop: threading.Event) -> None:
+        try:
+            while not stop.is_set():
+                try:
+                    frame = self._frames.read(_WAIT_S)
+                except BadFrameError as bad:
+                    self._slot.put(_Missed(bad.stamp_ns, str(bad)))
+                    continue
+                if frame is not None:
+                    self._slot.put(frame)
+        except EndOfFrames:
+            logger.info("no more frames")
+        except Exception as error:  # the thread's one loop: whatever ends it must end the daemon, not hide
+            if not stop.is_set():
+                logger.exception("camera thread")
+                self._capture_failure = error
+        finally:
+            self._ended.set()
+
+    def _work(self, stop: threading.Event) -> None:
+        errors = 0
+        while not stop.is_set():
+            systemd.notify("WATCHDOG=1")
+            if self._link.failure is not None:
+                raise LinkError(f"the link's thread ended: {self._link.failure}") from self._link.failure
+            item = self._slot.take(_WAIT_S)
+            self._report_status()
+            if item is None:
+                if self._ended.is_set():
+                    return
+                continue
+            try:
+                self._handle(item, stop)
+                errors = 0
+            except Exception as error:  # one spot per thread, around one item (house style)
+                errors += 1
+                logger.exception("frame at %d ns", item.stamp_ns)
+                self._publish(None, Rejected(item.stamp_ns, Reason.INTERNAL, repr(error)))
+                if errors >= _MAX_ERRORS_IN_A_ROW:
+                    raise OrtholocError(f"{errors} frames in a row failed, last with {error!r}") from error
+
+    def _warm_up(self) -> None:
+        """The first inference allocates and compiles; it must not happen in flight."""
+        camera = self._config.intrinsics.camera()
+        self._matcher.extract(np.zeros((camera.height, camera.width), np.uint8))
+
+    # -- one frame -------------------------------------------------------------------------------------
+
+    def _handle(self, item: Frame | _Missed, stop: threading.Event) -> None:
+        if isinstance(item, _Missed):
+            self._publish(None, Rejected(item.stamp_ns, Reason.BAD_FRAME, item.why))
+            return
+        known = self._state_at(item.stamp_ns, stop)
+        state = self._vehicle_state(item.stamp_ns, known)
+        outcome = self._navigator.step(item, state)
+        if isinstance(outcome, Fix):
+            self._send(outcome, known)
+        self._publish(item, outcome)
+
+    def _state_at(self, stamp_ns: int, stop: threading.Event) -> AutopilotState | None:
+        """The autopilot's state at an exposure, waiting a little for the telemetry that follows it."""
+        deadline_ns = self._clock.now_ns() + round(_STATE_WAIT_S * 1e9)
+        while True:
+            known = self._link.state_at(stamp_ns)
+            if known is not None and known.ned_from_body is not None:
+                return known
+            if self._clock.now_ns() >= deadline_ns or stop.wait(0.01):
+                return known
+
+    def _vehicle_state(self, stamp_ns: int, known: AutopilotState | None) -> VehicleState:
+        roll, pitch, yaw = (math.radians(sigma) for sigma in self._config.attitude.sigma_deg)
+        if known is None:
+            return VehicleState(stamp_ns, None, (roll, pitch, yaw))
+        has_odometry = self._odometry.add(stamp_ns, known.velocity_ned)
+        position = sigma_m = None
+        if known.gnss is not None:
+            gnss = known.gnss
+            position = self._georeference.map_from_geodetic(
+                gnss.latitude_deg, gnss.longitude_deg, height_amsl_m=gnss.height_amsl_m
+            )
+            sigma_m = gnss.sigma_horizontal_m, gnss.sigma_vertical_m
+        return VehicleState(
+            stamp_ns,
+            known.ned_from_body,
+            (roll, pitch, yaw),
+            self._odometry.position_ned_m if has_odometry else None,
+            self._odometry.epoch,
+            position,
+            sigma_m or (0.0, 0.0),
+        )
+
+    def _send(self, fix: Fix, known: AutopilotState | None) -> None:
+        vehicle = self._link.vehicle
+        if known is None or vehicle is None:
+            return
+        map_from_body = fix.map_from_camera @ self._body_from_camera.inverse()
+        if known.origin is None:
+            self._counts["no_origin"] += 1
+            self._offer_origin(map_from_body.translation)
+            return
+        self._link.send_estimate(
+            vision_estimate(
+                fix,
+                map_from_body,
+                self._georeference,
+                known.origin,
+                earth_model(vehicle.autopilot),
+                self._navigator.tracker.reset_counter,
+            )
+        )
+
+    def _offer_origin(self, position_map: FloatArray) -> None:
+        place = self._georeference.geodetic_from_map(position_map)
+        if place.height_amsl_m is not None:
+            self._link.offer_origin(GeodeticOrigin(place.lat_deg, place.lon_deg, place.height_amsl_m))
+
+    def _publish(self, frame: Frame | None, outcome: Outcome) -> None:
+        self._counts["fixes" if isinstance(outcome, Fix) else "rejected"] += 1
+        if self._recorder is not None:
+            self._recorder.put(frame.name if frame is not None else None, outcome)
+        if self._bus is not None:
+            self._bus.publish(outcome)
+        if self._on_outcome is not None:
+            self._on_outcome(frame, outcome)
+
+    def _report_status(self) -> None:
+        now_ns = self._clock.now_ns()
+        if now_ns - self._last_status_ns < _STATUS_INTERVAL_NS:
+            return
+        self._last_status_ns = now_ns
+        status = self._navigator.tracker.status
+        tracking = status is TrackerStatus.TRACK
+        self._link.set_system_status(SystemStatus.ACTIVE if tracking else SystemStatus.STANDBY)
+        systemd.notify(f"STATUS={status}, {self._counts['fixes']} fixes, {self._counts['rejected']} rejected")
+        if self._counts["no_origin"] and self._link.connected():
+            self._link.send_status_text(Severity.WARNING, "OrthoLoC: EKF origin unknown, fixes not sent")
+            self._counts["no_origin"] = 0
+
+
+def vision_estimate(
+    fix: Fix,
+    map_from_body: Rigid3,
+    georeference: Georeference,
+    origin: GeodeticOrigin,
+    model: EarthModel,
+    reset_counter: int,
+) -> VisionEstimate:
+    """A fix as the autopilot wants it: the body in its local NED, true north.
+
+    Args:
+        map_from_body: of the fix.
+        model: by which the autopilot itself relates its local frame to latitude and longitude.
+    Raises: MapError if the pack does not say how its heights relate to AMSL.
+    """
+    place = georeference.geodetic_from_map(map_from_body.translation)
+    if place.height_amsl_m is None:
+        raise MapError("the pack's heights can't be turned into AMSL; rebuild it with --geoid-undulation-m")
+    ned_from_map = frames.map_from_ned_rotation(georeference.convergence_rad(map_from_body.translation[:2])).T
+    lever = map_from_body.translation - fix.map_from_camera.translation
+    return VisionEstimate(
+        fix.stamp_ns,
+        ned_from_geodetic(origin, place.lat_deg, place.lon_deg, place.height_amsl_m, model),
+        ned_from_map @ map_from_body.rotation,
+        cov.rotated(cov.of_moved_point(fix.covariance, lever), ned_from_map),
+        reset_counter,
+        min(fix.quality, 1.0),
+    )
+
+
+def _require_flyable(georeference: Georeference, pack: str) -> None:
+    if georeference.crs is None:
+        raise MapError(f"{pack}: has no reference system, so its positions mean nothing to an autopilot")
+    try:
+        georeference.vertical.amsl_from_map(0.0)
+    except MapError as err:
+        raise MapError(
+            f"{pack}: {err} Until then a fix could be wrong by the height of the geoid, 30 to 50 m."
+        ) from err
