@@ -33,6 +33,7 @@ from ortholoc_edge.tiles.georeference import (
     Georeference,
     VerticalDatum,
     VerticalKind,
+    datum_shift_caveat,
     derive_vertical,
     projected_crs,
     vertical_of,
@@ -178,16 +179,13 @@ def build_pack(
         anchor = _anchor(dop_source.grid)
         georeference = Georeference(crs, _vertical(options, crs, anchor, dsm_source), anchor)
         with _staging(out) as staged:
-            manifest = _write(
-                dop_source, dsm_source, staged, georeference=georeference, options=options, say=say
-            )
+            manifest = _write(dop_source, dsm_source, staged, georeference=georeference, options=options, say=say)
             write_manifest(manifest, staged / MANIFEST_NAME)
             say(0.9, "checking the pack")
             problems = Pack.open(staged).verify()
             if problems:
                 raise MapError(
-                    f"{out}: what was written does not read back ({problems[0]}); check the disk and build"
-                    " again"
+                    f"{out}: what was written does not read back ({problems[0]}); check the disk and build again"
                 )
             for path in (*staged.iterdir(), staged):
                 _fsync(path)
@@ -251,9 +249,7 @@ def _check_dop(source: _Source) -> None:
 def _check_dsm(source: _Source) -> None:
     dataset, path = source.dataset, source.path
     if any(c != ColorInterp.alpha for c in dataset.colorinterp[1:]):
-        raise MapError(
-            f"{path}: {dataset.count} bands, expected one of heights; select it with: gdal_translate -b"
-        )
+        raise MapError(f"{path}: {dataset.count} bands, expected one of heights; select it with: gdal_translate -b")
     if not np.issubdtype(np.dtype(dataset.dtypes[0]), np.number) or "complex" in dataset.dtypes[0]:
         raise MapError(f"{path}: samples are {dataset.dtypes[0]}, expected heights in metres")
     unit = (dataset.units[0] or "").lower()
@@ -295,9 +291,7 @@ def _check_overlap(dop: _Source, dsm: _Source) -> None:
         )
     coverage = shared / ((a[2] - a[0]) * (a[3] - a[1]))
     if coverage < _SPARSE_COVERAGE:
-        logger.warning(
-            "%s covers only %.0f %% of the orthophoto; there is no fix outside it", dsm.path, 100 * coverage
-        )
+        logger.warning("%s covers only %.0f %% of the orthophoto; there is no fix outside it", dsm.path, 100 * coverage)
 
 
 def _rounded(bounds: tuple[float, ...]) -> tuple[float, ...]:
@@ -310,9 +304,7 @@ def _anchor(grid: RasterGrid) -> tuple[float, float]:
     return round((west + east) / 2 / step) * step, round((south + north) / 2 / step) * step
 
 
-def _vertical(
-    options: PackOptions, crs: str | None, anchor: tuple[float, float], dsm: _Source
-) -> VerticalDatum:
+def _vertical(options: PackOptions, crs: str | None, anchor: tuple[float, float], dsm: _Source) -> VerticalDatum:
     kind, epsg = options.vertical, options.vertical_epsg
     named = None if dsm.crs is None else vertical_of(dsm.crs, str(dsm.path))
     if kind is None and named is not None:
@@ -327,6 +319,9 @@ def _vertical(
     if crs is not None:
         lon, lat = pyproj.Proj(projected_crs(crs, str(dsm.path)))(*anchor, inverse=True)
         lat_lon = (lat, lon)
+        caveat = datum_shift_caveat(crs, lat_lon)
+        if caveat is not None:
+            logger.warning("%s: %s", dsm.path, caveat)
     return derive_vertical(kind, epsg, options.geoid_undulation_m, lat_lon)
 
 
@@ -339,9 +334,7 @@ def _staging(out: Path) -> Iterator[Path]:
         # mkdtemp's 0700 would lock out the daemon's user.
         staged.chmod(0o755)
     except OSError as err:
-        raise MapError(
-            f"{out.parent}: cannot be written ({err.strerror}); choose another output path"
-        ) from err
+        raise MapError(f"{out.parent}: cannot be written ({err.strerror}); choose another output path") from err
     try:
         yield staged
     except (RasterioError, OSError) as err:
@@ -390,9 +383,7 @@ def _write(
     options: PackOptions,
     say: Progress,
 ) -> Manifest:
-    max_z_error_m = options.max_z_error_m or min(
-        _MAX_Z_ERROR_M, round(dsm.grid.gsd_m * _MAX_Z_ERROR_PER_GSD, 6)
-    )
+    max_z_error_m = options.max_z_error_m or min(_MAX_Z_ERROR_M, round(dsm.grid.gsd_m * _MAX_Z_ERROR_PER_GSD, 6))
     work = staged / "work.tif"
 
     valid = _normalise_dop(dop, work, lambda done: say(0.3 * done, "reading the orthophoto"))
@@ -476,7 +467,7 @@ def _normalise_dop(source: _Source, work: Path, done: Callable[[float], None]) -
             pixels = _read(source, bands, window)
             valid = _read(source, alpha, window) > 127 if alpha is not None else _mask(source, window)
             # One colour outside: what a lossy source has there is noise that costs bytes.
-            pixels[:, ~valid] = 0
+            pixels *= valid
             target.write(pixels, window=window)
             target.write_mask(valid, window=window)
             valid_px += int(np.count_nonzero(valid))
@@ -495,8 +486,9 @@ def _normalise_dsm(source: _Source, work: Path, done: Callable[[float], None]) -
         for window in _chunks(source.grid, done):
             raw = _read(source, 1, window).astype(np.float64)
             valid = _mask(source, window) & np.isfinite(raw)
-            sentinel = valid & (np.isin(raw, _SENTINELS) | (np.abs(raw) > _SENTINEL_MAGNITUDE))
-            if sentinel.any():
+            low_or_huge = valid & ((raw < _MIN_HEIGHT_M) | (raw > _SENTINEL_MAGNITUDE))
+            if low_or_huge.any():
+                sentinel = low_or_huge & (np.isin(raw, _SENTINELS) | (np.abs(raw) > _SENTINEL_MAGNITUDE))
                 undeclared.update(np.unique(raw[sentinel]).tolist())
                 valid &= ~sentinel
             heights = raw * scale + offset

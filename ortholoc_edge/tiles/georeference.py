@@ -130,9 +130,7 @@ class LocalFrame:
     def local_from_map(self, points_map: npt.ArrayLike) -> FloatArray:
         """Points (..., 3) float64 from map to local metres."""
         points = np.array(points_map, dtype=np.float64)
-        points[..., :2] = (
-            points[..., :2] - (self.origin_easting_m, self.origin_northing_m)
-        ) / self.grid_scale
+        points[..., :2] = (points[..., :2] - (self.origin_easting_m, self.origin_northing_m)) / self.grid_scale
         return points
 
     def map_from_local(self, points_local: npt.ArrayLike) -> FloatArray:
@@ -154,7 +152,8 @@ class LocalFrame:
 class Georeference:
     """A projected reference system, or none (a local metric frame), with its vertical datum.
 
-    Safe to call from several threads.
+    Safe to call from several threads. The way to WGS 84 is PROJ's: for ETRS89 and NAD83 (2011) systems the null
+    transformation, which leaves out the plates' motion (0.8 m in Europe, about 1.2 m in the USA by now).
 
     Attributes:
         crs: "EPSG:n" or WKT of a projected, conformal system in metres; None: local metres, where convergence
@@ -267,6 +266,21 @@ class Georeference:
         return float(first), float(second)
 
 
+def datum_shift_caveat(crs: str, lat_lon_deg: tuple[float, float]) -> str | None:
+    """What PROJ lacks for the best way from ``crs`` to WGS 84 at a place; None if nothing.
+
+    Without its grid an old national datum (DHDN, NAD27) is shifted by a few parameters, metres off.
+    """
+    lat, lon = lat_lon_deg
+    group = _group(projected_crs(crs, crs), "EPSG:4326", lon, lat)
+    if group.best_available or not group.unavailable_operations:
+        return None
+    grids = [grid.short_name for grid in group.unavailable_operations[0].grids if not grid.available]
+    accuracies = [one.accuracy for one in group.transformers if one.accuracy >= 0]
+    good_to = f"to about {min(accuracies):g} m" if accuracies else "to nobody knows what"
+    return f"PROJ lacks {', '.join(grids)}: latitudes and longitudes are good {good_to}"
+
+
 def projected_crs(crs: str, what: str) -> CRS:
     """The horizontal part of a projected reference system in metres.
 
@@ -361,14 +375,10 @@ def derive_vertical(
             name="WGS 84 ellipsoid",
             amsl_minus_map_m=amsl_minus_ellipsoid,
             ellipsoid_minus_map_m=0.0,
-            derivation=derivation
-            if amsl_minus_ellipsoid is not None
-            else "no geoid grid in PROJ, none stated",
+            derivation=derivation if amsl_minus_ellipsoid is not None else "no geoid grid in PROJ, none stated",
         )
     name = None if epsg is None else _vertical_name(epsg)
-    ellipsoid_minus_map = (
-        None if epsg is None else _grid_offset(f"EPSG:4326+{epsg}", "EPSG:4979", lat_lon_deg)
-    )
+    ellipsoid_minus_map = None if epsg is None else _grid_offset(f"EPSG:4326+{epsg}", "EPSG:4979", lat_lon_deg)
     if ellipsoid_minus_map is not None:
         _check_undulation(geoid_undulation_m, -ellipsoid_minus_map)
     if ellipsoid_minus_map is not None and amsl_minus_ellipsoid is not None:
@@ -399,17 +409,7 @@ def _grid_offset(source: str, target: str, lat_lon_deg: tuple[float, float] | No
     if lat_lon_deg is None:
         return None
     lat, lon = lat_lon_deg
-    # A geoid fetched from the network today would be missing on the next build; the pack would differ.
-    set_network_enabled(active=False)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Best transformation is not available")
-        group = TransformerGroup(
-            source,
-            target,
-            always_xy=True,
-            area_of_interest=_area(lon, lat),
-            allow_ballpark=False,
-        )
+    group = _group(source, target, lon, lat)
     for transformer in group.transformers:
         operations = transformer.operations or ()
         grids = [grid for operation in operations for grid in operation.grids]
@@ -419,6 +419,15 @@ def _grid_offset(source: str, target: str, lat_lon_deg: tuple[float, float] | No
         if np.isfinite(height):
             return float(height)
     return None
+
+
+def _group(source: CRS | str, target: str, lon: float, lat: float) -> TransformerGroup:
+    """PROJ's ways between two systems at a place, best first, without those that pretend."""
+    # A grid fetched from the network today would be missing on the next build; the pack would differ.
+    set_network_enabled(active=False)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Best transformation is not available")
+        return TransformerGroup(source, target, always_xy=True, area_of_interest=_area(lon, lat), allow_ballpark=False)
 
 
 def _check_undulation(stated_m: float | None, amsl_minus_ellipsoid: float | None) -> None:
@@ -435,9 +444,7 @@ def _check_undulation(stated_m: float | None, amsl_minus_ellipsoid: float | None
 def _vertical_name(epsg: int) -> str:
     crs = _parsed(f"EPSG:{epsg}", f"--vertical-epsg {epsg}")
     if not crs.is_vertical:
-        raise MapError(
-            f"--vertical-epsg {epsg}: {crs.name} is no vertical system; name one such as 5773 or 7837"
-        )
+        raise MapError(f"--vertical-epsg {epsg}: {crs.name} is no vertical system; name one such as 5773 or 7837")
     _require_metre_heights(crs.axis_info[0], crs.name, f"--vertical-epsg {epsg}")
     return str(crs.name)
 
@@ -472,6 +479,7 @@ def _north_over_east_scale(crs: CRS, proj: Any, xy_map: tuple[float, float]) -> 
     Measured with geodesics, because PROJ's own factors call web Mercator conformal: it is, on a sphere.
     """
     geod, (lon, lat) = crs.get_geod(), proj(*xy_map, inverse=True)
+    assert geod is not None, "a projected system has an ellipsoid"
     lengths = []
     for azimuth_deg in (0.0, 90.0):
         ends = [geod.fwd(lon, lat, azimuth_deg + turn, _PROBE_M)[:2] for turn in (0.0, 180.0)]

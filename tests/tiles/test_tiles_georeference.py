@@ -14,7 +14,13 @@ from ortholoc_edge.errors import ConfigError, MapError
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.frames import ecef_from_geodetic, map_from_ned_rotation, ned_from_ecef_rotation
 from ortholoc_edge.geometry.rigid import Rigid3
-from ortholoc_edge.tiles.georeference import Georeference, LocalFrame, VerticalDatum, derive_vertical
+from ortholoc_edge.tiles.georeference import (
+    Georeference,
+    LocalFrame,
+    VerticalDatum,
+    datum_shift_caveat,
+    derive_vertical,
+)
 
 ELLIPSOIDAL = VerticalDatum(kind="ellipsoid", ellipsoid_minus_map_m=0.0, amsl_minus_map_m=-47.5)
 UNKNOWN = VerticalDatum(kind="unknown")
@@ -86,9 +92,7 @@ def test_local_frame_measures_true_metres(crs, lat, lon, height_m):
         ecef = []
         for point in (start, end):
             at = reference.geodetic_from_map(point)
-            ecef.append(
-                ecef_from_geodetic(np.deg2rad(at.lat_deg), np.deg2rad(at.lon_deg), at.height_ellipsoid_m)
-            )
+            ecef.append(ecef_from_geodetic(np.deg2rad(at.lat_deg), np.deg2rad(at.lon_deg), at.height_ellipsoid_m))
         # 2 mm of 200 m: the scale changes along the line, and the Earth's radius with the place.
         assert np.linalg.norm(ecef[1] - ecef[0]) == pytest.approx(np.linalg.norm(step), abs=2e-3)
 
@@ -104,9 +108,7 @@ def test_a_vector_turned_by_convergence_agrees_with_the_tangent_plane(crs, lat, 
 
     a, b = (reference.geodetic_from_map(point) for point in (start, end))
     radians = np.deg2rad([a.lat_deg, a.lon_deg])
-    ecef = [
-        ecef_from_geodetic(np.deg2rad(p.lat_deg), np.deg2rad(p.lon_deg), p.height_ellipsoid_m) for p in (a, b)
-    ]
+    ecef = [ecef_from_geodetic(np.deg2rad(p.lat_deg), np.deg2rad(p.lon_deg), p.height_ellipsoid_m) for p in (a, b)]
     assert np.allclose(ned_from_ecef_rotation(*radians) @ (ecef[1] - ecef[0]), offset_ned, atol=5e-3)
 
 
@@ -118,9 +120,7 @@ def test_a_vector_turned_by_convergence_agrees_with_the_tangent_plane(crs, lat, 
 def test_geodetic_round_trip(easting, northing, height):
     reference = Georeference("EPSG:32633", ELLIPSOIDAL, (500_000.0, 5_000_000.0))
     at = reference.geodetic_from_map((easting, northing, height))
-    by_ellipsoid = reference.map_from_geodetic(
-        at.lat_deg, at.lon_deg, height_ellipsoid_m=at.height_ellipsoid_m
-    )
+    by_ellipsoid = reference.map_from_geodetic(at.lat_deg, at.lon_deg, height_ellipsoid_m=at.height_ellipsoid_m)
     by_amsl = reference.map_from_geodetic(at.lat_deg, at.lon_deg, height_amsl_m=at.height_amsl_m)
     assert np.allclose(by_ellipsoid, (easting, northing, height), rtol=0, atol=1e-5)
     assert np.allclose(by_amsl, by_ellipsoid, rtol=0, atol=1e-9)
@@ -275,3 +275,11 @@ def test_geoid_grid_is_used_where_proj_has_it(tmp_path):
         check=False,
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_missing_datum_grid_is_told():
+    caveat = datum_shift_caveat("EPSG:31467", (49.6, 9.0))
+    assert caveat is not None
+    assert "BETA2007" in caveat
+    assert datum_shift_caveat("EPSG:32632", (49.6, 9.0)) is None
+    assert datum_shift_caveat("EPSG:25832", (49.6, 9.0)) is None

@@ -241,17 +241,13 @@ def test_several_threads_read_what_one_does(holed_store):
     with ThreadPoolExecutor(8) as pool:
         together = list(pool.map(read, requests))
     for one, other in zip(alone, together, strict=True):
-        assert all(
-            np.array_equal(a, b, equal_nan=a.dtype.kind == "f") for a, b in zip(one, other, strict=True)
-        )
+        assert all(np.array_equal(a, b, equal_nan=a.dtype.kind == "f") for a, b in zip(one, other, strict=True))
 
 
 def test_cache_is_bounded_and_memory_is_the_files(plane_pack):
     with MapStore(plane_pack, cache_bytes=3 * 2**20) as store:
         assert get_gdal_config("GDAL_CACHEMAX") == 3 * 2**20
-        assert store.compressed_bytes == sum(
-            (plane_pack.path / f).stat().st_size for f in ("dop.tif", "dsm.tif")
-        )
+        assert store.compressed_bytes == sum((plane_pack.path / f).stat().st_size for f in ("dop.tif", "dsm.tif"))
         assert store.read(store.bounds, 0.1).dop.shape == (1307, 1475, 3)
 
 
@@ -278,9 +274,7 @@ def flip(path, at):
 
 def offset_of(path, column, row, level=0):
     with rasterio.open(path) as dataset:
-        item = dataset.get_tag_item(
-            f"BLOCK_OFFSET_{column}_{row}", "TIFF", bidx=1, ovr=level - 1 if level else None
-        )
+        item = dataset.get_tag_item(f"BLOCK_OFFSET_{column}_{row}", "TIFF", bidx=1, ovr=level - 1 if level else None)
     return int(item)
 
 
