@@ -263,9 +263,7 @@ class FakeAutopilot:
         }
         if self.origin is not None:
             origin = self.origin
-            makers[d.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN] = lambda ms: d.MAVLink_gps_global_origin_message(
-                *origin
-            )
+            makers[d.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN] = lambda ms: d.MAVLink_gps_global_origin_message(*origin)
         make = makers.get(message_id)
         return make(boot_ms) if make else None
 

@@ -54,9 +54,7 @@ def test_reads_rgb(tmp_path, suffix):
     path.write_bytes(encoded(suffix))
     image = read_image(path)
     assert image.shape == (48, 64, 3) and image.dtype == np.uint8 and not image.flags.writeable
-    np.testing.assert_allclose(
-        image[20:40, 2:28].mean((0, 1))[0], picture()[20:40, 2:28].mean((0, 1))[0], atol=6
-    )
+    np.testing.assert_allclose(image[20:40, 2:28].mean((0, 1))[0], picture()[20:40, 2:28].mean((0, 1))[0], atol=6)
     assert image[..., 0].mean() > 50 > image[..., 2].mean()
 
 
@@ -83,9 +81,7 @@ def test_every_truncation_is_refused(tmp_path, suffix, part):
 
 def test_progressive_jpeg_with_thumbnail_and_tail(tmp_path):
     """The walk survives several scans, an end marker inside a segment and bytes after the end."""
-    ok, data = cv2.imencode(
-        ".jpg", picture(), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1, cv2.IMWRITE_JPEG_RST_INTERVAL, 2]
-    )
+    ok, data = cv2.imencode(".jpg", picture(), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1, cv2.IMWRITE_JPEG_RST_INTERVAL, 2])
     assert ok
     jpeg = data.tobytes()
     thumbnail = b"\xff\xe1" + (2 + 40).to_bytes(2, "big") + (b"\xff\xd8thumb\xff\xd9".ljust(40, b"x"))
@@ -95,6 +91,13 @@ def test_progressive_jpeg_with_thumbnail_and_tail(tmp_path):
     (tmp_path / "cut.jpg").write_bytes(whole[:-20])
     with pytest.raises(CameraError, match="truncated"):
         read_image(tmp_path / "cut.jpg")
+
+
+def test_bytes_between_segments_are_damage(tmp_path):
+    jpeg = encoded(".jpg")
+    (tmp_path / "shifted.jpg").write_bytes(jpeg[:2] + b"junk" + jpeg[2:])
+    with pytest.raises(CameraError, match="no segment begins at byte 2"):
+        read_image(tmp_path / "shifted.jpg")
 
 
 def test_zeroed_tail_and_flipped_bit(tmp_path):

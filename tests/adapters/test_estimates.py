@@ -110,6 +110,12 @@ def test_ardupilot_uses_the_sigma_we_mean(estimate, layout, decode):
     assert ardupilot_accepts_odometry(odometry)
 
 
+def test_horizontal_sigma_is_of_the_longer_axis():
+    covariance = np.eye(6)
+    covariance[:2, :2] = [[5.0, 4.0], [4.0, 5.0]]  # 3 m along north-east, 1 m across
+    assert horizontal_sigma_m(VisionEstimate(0, np.zeros(3), np.eye(3), covariance)) == pytest.approx(3.0)
+
+
 def test_the_contracts_figure_for_old_ardupilot():
     # Section 2.11: for E metres send sqrt(E^3 / 3) in each of three entries; in two of them that is sqrt(E^3
     # / 2).
@@ -138,9 +144,7 @@ def test_pose_survives_the_wire(estimate):
     assert vpe.usec == odometry.time_usec == estimate.stamp_ns // 1000
     assert vpe.reset_counter == odometry.reset_counter == estimate.reset_counter
     for message in (vpe, odometry):
-        np.testing.assert_allclose(
-            [message.x, message.y, message.z], estimate.position_ned_m, rtol=1e-6, atol=1e-6
-        )
+        np.testing.assert_allclose([message.x, message.y, message.z], estimate.position_ned_m, rtol=1e-6, atol=1e-6)
     from_vpe = rotation.from_euler(vpe.roll, vpe.pitch, vpe.yaw)
     assert rotation.angle_between(from_vpe, estimate.ned_from_body) < 1e-5
     assert rotation.angle_between(rotation.from_quaternion(odometry.q), estimate.ned_from_body) < 1e-5
@@ -243,9 +247,7 @@ def test_ardupilot_model_is_ardupilots(lat0, dlat, dlon):
         0.0,
         EarthModel.ARDUPILOT,
     )
-    np.testing.assert_allclose(
-        ned[:2], ardupilot_get_distance_ne(lat0, lon0, lat0 + dlat, lon0 + dlon), atol=1e-4
-    )
+    np.testing.assert_allclose(ned[:2], ardupilot_get_distance_ne(lat0, lon0, lat0 + dlat, lon0 + dlon), atol=1e-4)
 
 
 @pytest.mark.parametrize("latitude", [-50.0, 0.0, 50.0])
