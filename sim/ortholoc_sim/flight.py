@@ -1,0 +1,636 @@
+"""One simulated flight in real time: GNSS is lost after takeoff, and what is under test must bring the vehicle round.
+
+`run_flight` owns the world, the vehicle and the autopilot (a thread, real MAVLink over a loopback socket) and the
+camera (a process, so that drawing does not compete for this interpreter). What is under test, by default the real
+daemon, gets a `Bench` and runs until `Bench.stop` is set or the frames end; it cannot tell it from an aircraft.
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import select
+import threading
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from itertools import pairwise
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ortholoc_edge.adapters.camera import CameraOptions, EndOfFrames
+from ortholoc_edge.adapters.mavlink import LinkOptions
+from ortholoc_edge.clock import Clock, SystemClock
+from ortholoc_edge.config import Config, Intrinsics, MapOptions, MatcherOptions, MountOptions
+from ortholoc_edge.daemon import Daemon
+from ortholoc_edge.errors import CameraError, MapError, OrtholocError
+from ortholoc_edge.geometry import rotation
+from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
+from ortholoc_edge.geometry.camera import Camera
+from ortholoc_edge.geometry.rigid import Rigid3
+from ortholoc_edge.pipeline.frame import Frame
+from ortholoc_edge.pipeline.outcome import Fix, Outcome
+from ortholoc_edge.tiles.pack import Pack
+from ortholoc_edge.tiles.store import MapStore
+from ortholoc_sim import demo_pack_path
+from ortholoc_sim.autopilot import AutopilotOptions, UdpPort, Verdict
+from ortholoc_sim.camera import Placement, Renderer, Sensor
+from ortholoc_sim.epoch import FLIGHT, Epoch
+from ortholoc_sim.loop import STEP_NS, ClosedLoop, LoopOptions
+from ortholoc_sim.site import Site
+from ortholoc_sim.vehicle import VehicleOptions
+from ortholoc_sim.world import WorldSpec, build_scene, generate
+
+logger = logging.getLogger(__name__)
+
+_S = 1_000_000_000
+_WORLD_TIMEOUT_S = 90.0
+_RENDER_TIMEOUT_S = 20.0
+# The companion finds the autopilot and its time first.
+_FIRST_FRAME_S = 2.5
+# What a flight must reach (issue 2 asks for a failure when it did not localize; the figures are ours).
+MIN_FIXED_FRACTION, MIN_FIXES = 0.7, 10
+MAX_FIX_ERROR_M, MAX_FIX_ERROR_DEG = 10.0, 5.0
+MAX_AUTOPILOT_ERROR_M = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class FlightOptions:
+    """One flight over a pack that was made of the generated world ``spec``.
+
+    Attributes:
+        route_m: waypoints (east, north) in m from the pack's south-west corner.
+        height_agl_m: above the typical ground of the pack; the flight begins 20 m lower.
+        duration_s, gnss_until_s: of the flight, from its start.
+        frame_rate_hz: of the camera.
+        camera, mount: the one on board.
+        seed: of sensor errors, wind and noise.
+        matcher: of the daemon.
+    """
+
+    pack: Path | None = None
+    spec: WorldSpec = field(default_factory=WorldSpec)
+    epoch: Epoch = FLIGHT
+    route_m: tuple[tuple[float, float], ...] = (
+        (150.0, 130.0),
+        (370.0, 120.0),
+        (480.0, 230.0),
+        (420.0, 370.0),
+        (180.0, 385.0),
+    )
+    height_agl_m: float = 90.0
+    speed_m_s: float = 9.0
+    duration_s: float = 65.0
+    gnss_until_s: float = 10.0
+    frame_rate_hz: float = 2.0
+    camera: Camera = field(default_factory=lambda: Camera.from_focal(640, 480, 540.0))
+    mount: MountOptions = field(default_factory=MountOptions)
+    sensor: Sensor = field(default_factory=Sensor)
+    vehicle: VehicleOptions = field(default_factory=VehicleOptions)
+    autopilot: AutopilotOptions = field(default_factory=AutopilotOptions)
+    seed: int = 1
+    matcher: MatcherOptions = field(default_factory=lambda: MatcherOptions(threads=1))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bench:
+    """What is under test gets this.
+
+    Attributes:
+        pack: directory of the area pack.
+        camera, mount: as calibrated.
+        frames: the camera; a `FrameSource`.
+        endpoint: of the autopilot, as ``[link] endpoint`` takes it.
+        stop: set when the flight is over.
+        on_outcome: call with every outcome when it is ready, from any thread.
+    """
+
+    pack: Path
+    camera: Camera
+    mount: MountOptions
+    frames: SimulatedCamera
+    endpoint: str
+    stop: threading.Event
+    on_outcome: Callable[[Outcome], None]
+
+
+# Prepares (loads models, opens the map) and returns what to run once the vehicle is in the air.
+UnderTest = Callable[[Bench], Callable[[], None]]
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """Median, 90th percentile and maximum; NaN of nothing."""
+
+    median: float
+    p90: float
+    max: float
+
+    @staticmethod
+    def of(values: list[float]) -> Spread:
+        if not values:
+            return Spread(float("nan"), float("nan"), float("nan"))
+        return Spread(*(float(v) for v in np.percentile(values, [50, 90, 100])))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """Arrays of the flight, one row per sample; positions are map coordinates in m.
+
+    Attributes:
+        t_s: (N,) since the start.
+        truth_map_m, estimate_map_m: (N, 3) the vehicle, and where the autopilot believed it.
+        autopilot_error_m, dead_reckoning_error_m: (N,) horizontal; the latter NaN while there was GNSS.
+        fix_t_s, fix_map_m: (M,), (M, 3) camera centres of the fixes; fix_error_m: (M,) 3D.
+    """
+
+    t_s: FloatArray
+    truth_map_m: FloatArray
+    estimate_map_m: FloatArray
+    autopilot_error_m: FloatArray
+    dead_reckoning_error_m: FloatArray
+    fix_t_s: FloatArray
+    fix_map_m: FloatArray
+    fix_error_m: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FlightReport:
+    """What a flight came to; "after" means after GNSS was lost. Lengths in m, angles in degrees.
+
+    Attributes:
+        frames: given out by the camera. frames_after, fixes_after: outcomes and fixes of frames taken after.
+        rejections: of the whole flight, by reason.
+        horizontal_m, position_m, attitude_deg: errors of all fixes against the truth at their stamps.
+        latency_ms: from the middle of the exposure until the outcome, drawing the frame included.
+        autopilot_error_m: horizontal error of the autopilot's position after.
+        dead_reckoning_error_m: what it would have been without us.
+        final_dead_reckoning_error_m: at the end.
+        vision: what the autopilot's filter did with what it received.
+        problems: why `passed` is False, one line each.
+    """
+
+    duration_s: float
+    gnss_lost_s: float
+    frames: int
+    frames_after: int
+    fixes: int
+    fixes_after: int
+    rejections: dict[str, int]
+    horizontal_m: Spread
+    position_m: Spread
+    attitude_deg: Spread
+    latency_ms: Spread
+    autopilot_error_m: Spread
+    dead_reckoning_error_m: Spread
+    final_dead_reckoning_error_m: float
+    vision: dict[str, int]
+    autopilot_counts: dict[str, int]
+    track: Track
+    problems: tuple[str, ...]
+
+    @property
+    def passed(self) -> bool:
+        return not self.problems
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON: all but the track."""
+        plain = {k: v for k, v in asdict(replace(self, track=None)).items() if k != "track"}  # type: ignore[arg-type]
+        return {"passed": self.passed, **plain}
+
+
+# -- the camera --------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Studio:
+    """What the drawing process needs to begin."""
+
+    spec: WorldSpec
+    epoch: Epoch
+    placement: Placement
+    sensor: Sensor
+    camera: Camera
+
+
+def _draw(studio: _Studio, pipe: Connection) -> None:
+    """Main of the drawing process: poses come in, pictures go out, until the pipe closes."""
+    cv2.setNumThreads(1)
+    renderer = Renderer(build_scene(generate(studio.spec), studio.epoch), studio.placement, studio.sensor)
+    pipe.send("ready")
+    while True:
+        try:
+            pose, seed = pipe.recv()
+            pipe.send(renderer.render(studio.camera, pose, seed))
+        except (EOFError, OSError):
+            return
+
+
+class SimulatedCamera:
+    """A `FrameSource` that shows the world as the vehicle truly stands in it.
+
+    Frames are due at a fixed rate; one that is late because drawing takes longer than a period is left out, as a
+    camera would drop it. The stamp is the moment that the picture shows.
+    """
+
+    def __init__(self, studio: _Studio, pose_at: Callable[[int], Rigid3 | None], rate_hz: float, clock: Clock) -> None:
+        self._pose_at, self._clock = pose_at, clock
+        self._period_ns = round(_S / rate_hz)
+        self._due_ns: int | None = None
+        self._end_ns: int | None = None
+        self._waiting: int | None = None
+        self._closed = threading.Event()
+        self.frames = 0
+        # Not forked: a fork copies locks that other threads hold.
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=_draw, args=(studio, theirs), name="simulated-camera", daemon=True)
+        self._process.start()
+        theirs.close()
+
+    def wait_ready(self) -> None:
+        """Wait until the world is made. Raises: CameraError if that fails."""
+        if self._receive(_WORLD_TIMEOUT_S) != "ready":
+            raise CameraError("simulated camera: the world was not ready in time; is the machine overloaded?")
+
+    def roll(self, first_ns: int, end_ns: int) -> None:
+        """Take pictures from ``first_ns`` until ``end_ns``."""
+        self._due_ns, self._end_ns = first_ns, end_ns
+
+    def read(self, timeout_s: float) -> Frame | None:
+        """See `FrameSource.read`."""
+        deadline_ns = self._clock.now_ns() + round(timeout_s * _S)
+        while True:
+            now_ns = self._clock.now_ns()
+            if self._closed.is_set() or (self._end_ns is not None and now_ns >= self._end_ns):
+                raise EndOfFrames
+            if self._waiting is None and self._due_ns is not None and now_ns >= self._due_ns:
+                self._request(now_ns)
+            left_s = max(0.0, (deadline_ns - now_ns) / _S)
+            if self._waiting is not None:
+                image = self._receive(min(left_s, 0.1))
+                if image is not None:
+                    stamp_ns, self._waiting = self._waiting, None
+                    self.frames += 1
+                    image.flags.writeable = False
+                    return Frame(stamp_ns, image, f"{self.frames:05d}")
+            if now_ns >= deadline_ns:
+                return None
+            if self._waiting is None:
+                due_s = 0.1 if self._due_ns is None else (self._due_ns - now_ns) / _S
+                self._closed.wait(min(max(due_s, 0.002), left_s, 0.1))
+
+    def _request(self, now_ns: int) -> None:
+        assert self._due_ns is not None
+        # The newest moment due; the loop may be a step behind the clock, then it is asked again.
+        stamp_ns = self._due_ns + (now_ns - self._due_ns) // self._period_ns * self._period_ns
+        pose = self._pose_at(stamp_ns)
+        if pose is None:
+            return
+        self._due_ns = stamp_ns + self._period_ns
+        self._pipe.send((pose, self.frames))
+        self._waiting = stamp_ns
+
+    def _receive(self, timeout_s: float) -> Any:
+        try:
+            return self._pipe.recv() if self._pipe.poll(timeout_s) else None
+        except (EOFError, OSError) as error:
+            if self._closed.is_set():
+                raise EndOfFrames from error
+            raise CameraError(
+                "simulated camera: its process ended; run again with a lower frame rate or more memory"
+            ) from error
+
+    def close(self) -> None:
+        """See `FrameSource.close`."""
+        self._closed.set()
+
+    def shut_down(self) -> None:
+        """End the drawing process."""
+        self.close()
+        self._pipe.close()
+        self._process.join(timeout=_RENDER_TIMEOUT_S)
+        if self._process.is_alive():
+            self._process.terminate()
+            self._process.join()
+        self._process.close()
+
+
+# -- the flight --------------------------------------------------------------
+
+
+def daemon_under_test(matcher: MatcherOptions) -> UnderTest:
+    """The real daemon, in this process, configured for the bench's camera, pack and autopilot."""
+
+    def prepare(bench: Bench) -> Callable[[], None]:
+        camera = bench.camera
+        config = Config(
+            camera=CameraOptions(source="folder:unused"),
+            intrinsics=Intrinsics(
+                width_px=camera.width, height_px=camera.height, fx=camera.fx, fy=camera.fy, cx=camera.cx,
+                cy=camera.cy, distortion=camera.distortion,
+            ),
+            map=MapOptions(pack=str(bench.pack)),
+            link=LinkOptions(endpoint=bench.endpoint),
+            mount=bench.mount,
+            matcher=matcher,
+        )  # fmt: skip
+        daemon = Daemon(config, frames=bench.frames, on_outcome=lambda _, outcome: bench.on_outcome(outcome))
+        return lambda: daemon.run(bench.stop)
+
+    return prepare
+
+
+def run_flight(options: FlightOptions, under_test: UnderTest | None = None, clock: Clock | None = None) -> FlightReport:
+    """Fly once in real time.
+
+    Args:
+        under_test: the companion computer, by default `daemon_under_test`. Runs in this thread and must return
+            soon after `Bench.stop` is set.
+        clock: the one that frames are stamped with; must be what ``under_test`` stamps with too.
+    Raises: MapError for an unusable pack; CameraError if the world cannot be drawn; whatever ``under_test`` raises.
+    """
+    clock = clock or SystemClock()
+    path = options.pack or demo_pack_path()
+    pack = Pack.open(path)
+    site, route = _site_and_route(pack, options)
+    placement = _placement(pack, site, options.spec)
+    body_from_camera = options.mount.body_from_camera()
+    loop_holder: list[ClosedLoop] = []
+
+    def pose_at(stamp_ns: int) -> Rigid3 | None:
+        truth = loop_holder[0].truth_at(stamp_ns) if loop_holder else None
+        if truth is None:
+            return None
+        return site.camera_pose(truth.position_ned_m, truth.ned_from_body, body_from_camera)
+
+    outcomes: list[tuple[int, Outcome]] = []
+    failures: list[BaseException] = []
+    stop = threading.Event()
+    camera = SimulatedCamera(
+        _Studio(options.spec, options.epoch, placement, options.sensor, options.camera),
+        pose_at, options.frame_rate_hz, clock,
+    )  # fmt: skip
+    port = UdpPort(options.autopilot.system_id)
+    try:
+        # The world is made in the camera's process meanwhile.
+        run = (under_test or daemon_under_test(options.matcher))(
+            Bench(
+                path, options.camera, options.mount, camera, f"udpout:127.0.0.1:{port.port}", stop,
+                lambda outcome: outcomes.append((clock.now_ns(), outcome)),
+            )
+        )  # fmt: skip
+        camera.wait_ready()
+        start_ns = clock.now_ns()
+        end_ns = start_ns + round(options.duration_s * _S)
+        loop = ClosedLoop(
+            site,
+            LoopOptions(
+                route, options.speed_m_s, gnss_until_s=options.gnss_until_s, vehicle=options.vehicle,
+                autopilot=replace(options.autopilot, seed=options.autopilot.seed + options.seed), seed=options.seed,
+            ),
+            start_ns,
+        )  # fmt: skip
+        loop_holder.append(loop)
+        camera.roll(start_ns + round(_FIRST_FRAME_S * _S), end_ns)
+        thread = threading.Thread(
+            target=_fly, args=(loop, port, clock, end_ns, stop, failures), name="simulated-aircraft", daemon=True
+        )
+        thread.start()
+        try:
+            run()
+        finally:
+            stop.set()
+            thread.join(timeout=5.0)
+    finally:
+        stop.set()
+        camera.shut_down()
+        port.close()
+    if failures:
+        raise OrtholocError(f"simulated aircraft: {failures[0]}") from failures[0]
+    return make_report(loop, site, options, list(outcomes), camera.frames)
+
+
+def _fly(
+    loop: ClosedLoop, port: UdpPort, clock: Clock, end_ns: int, stop: threading.Event, failures: list[BaseException]
+) -> None:
+    """The aircraft's thread: steps on time, messages as they come."""
+    try:
+        while not stop.is_set():
+            now_ns = clock.now_ns()
+            if now_ns >= end_ns:
+                break
+            port.send(loop.advance(now_ns))
+            wait_s = max(0.0, (loop.now_ns + STEP_NS - clock.now_ns()) / _S)
+            readable, _, _ = select.select([port], [], [], wait_s)
+            if readable:
+                port.send(loop.receive(port.receive(), clock.now_ns()))
+    except BaseException as error:
+        logger.exception("simulated aircraft ends")
+        failures.append(error)
+    finally:
+        stop.set()
+
+
+def _site_and_route(pack: Pack, options: FlightOptions) -> tuple[Site, FloatArray]:
+    with MapStore(pack) as store:
+        west, south, _, _ = store.bounds
+        xy = np.array(options.route_m, dtype=np.float64) + np.array([west, south])
+        # Trees and roofs lift the mean, not the median.
+        ground = store.heights(_along(xy, 10.0))
+    if not np.isfinite(ground).any():
+        raise MapError(f"area pack {pack.path}: no heights under the route; choose another route")
+    level = float(np.nanmedian(ground))
+    centre = xy.mean(axis=0)
+    site = Site(pack.georeference, np.array([*centre, level]))
+    return site, np.column_stack([xy, np.full(len(xy), level + options.height_agl_m)])
+
+
+def _along(points: FloatArray, step_m: float) -> FloatArray:
+    pieces = [
+        a + (b - a) * np.linspace(0.0, 1.0, max(2, int(np.hypot(*(b - a)) / step_m)))[:, None]
+        for a, b in pairwise(points)
+    ]
+    return np.vstack(pieces)
+
+
+def _placement(pack: Pack, site: Site, spec: WorldSpec) -> Placement:
+    west, south, east, north = pack.manifest.dop.grid.raster_grid().bounds
+    if abs(east - west - spec.width_m) > 1.0 or abs(north - south - spec.height_m) > 1.0:
+        raise MapError(
+            f"area pack {pack.path}: {east - west:.0f} x {north - south:.0f} m, the generated world has "
+            f"{spec.width_m:.0f} x {spec.height_m:.0f} m; make it with python -m ortholoc_sim.make_demo_pack"
+        )
+    return Placement(west, south, site.grid_scale)
+
+
+# -- what it came to ---------------------------------------------------------
+
+
+def make_report(
+    loop: ClosedLoop, site: Site, options: FlightOptions, outcomes: list[tuple[int, Outcome]], frames: int
+) -> FlightReport:
+    """Compare ``outcomes`` (when each was ready, and what) with the truth of the flown ``loop``."""
+    lost_ns = loop.gnss_lost_ns
+    start_ns = loop.samples[0].stamp_ns - STEP_NS
+    horizontal, position, attitude, latency = [], [], [], []
+    fix_t, fix_map = [], []
+    body_from_camera = options.mount.body_from_camera()
+    rejections: Counter[str] = Counter()
+    frames_after = fixes_after = 0
+    for ready_ns, outcome in outcomes:
+        frames_after += outcome.stamp_ns >= lost_ns
+        latency.append((ready_ns - outcome.stamp_ns) / 1e6)
+        if not isinstance(outcome, Fix):
+            rejections[str(outcome.reason)] += 1
+            continue
+        truth = loop.truth_at(outcome.stamp_ns)
+        if truth is None:
+            continue
+        fixes_after += outcome.stamp_ns >= lost_ns
+        pose = site.camera_pose(truth.position_ned_m, truth.ned_from_body, body_from_camera)
+        difference = outcome.map_from_camera.translation - pose.translation
+        difference[:2] /= site.grid_scale
+        horizontal.append(float(np.hypot(*difference[:2])))
+        position.append(float(np.linalg.norm(difference)))
+        attitude.append(float(np.rad2deg(rotation.angle_between(outcome.map_from_camera.rotation, pose.rotation))))
+        fix_t.append((outcome.stamp_ns - start_ns) / _S)
+        fix_map.append(outcome.map_from_camera.translation)
+    samples = loop.samples[::10]
+    autopilot = np.array([np.hypot(*(s.estimate_m - s.true_m)[:2]) for s in samples])
+    reckoned = np.array(
+        [np.nan if s.dead_reckoned_m is None else np.hypot(*(s.dead_reckoned_m - s.true_m[:2])) for s in samples]
+    )
+    after = np.array([s.stamp_ns >= lost_ns for s in samples])
+    track = Track(
+        np.array([(s.stamp_ns - start_ns) / _S for s in samples]),
+        np.array([site.map_from_ned(s.truth.position_ned_m) for s in samples]),
+        np.array([site.map_from_ned(site.ned_from_autopilot(s.estimate_m)) for s in samples]),
+        autopilot,
+        reckoned,
+        np.array(fix_t),
+        np.array(fix_map).reshape(-1, 3),
+        np.array(position),
+    )
+    known = reckoned[np.isfinite(reckoned)]
+    vision = Counter(str(record.verdict) for record in loop.autopilot.vision)
+    errors_after = [float(v) for v in autopilot[after]]
+    return FlightReport(
+        duration_s=(loop.now_ns - start_ns) / _S,
+        gnss_lost_s=(lost_ns - start_ns) / _S,
+        frames=frames,
+        frames_after=frames_after,
+        fixes=len(position),
+        fixes_after=fixes_after,
+        rejections=dict(rejections),
+        horizontal_m=Spread.of(horizontal),
+        position_m=Spread.of(position),
+        attitude_deg=Spread.of(attitude),
+        latency_ms=Spread.of(latency),
+        autopilot_error_m=Spread.of(errors_after),
+        dead_reckoning_error_m=Spread.of([float(v) for v in known]),
+        final_dead_reckoning_error_m=float(known[-1]) if len(known) else float("nan"),
+        vision={str(v): vision.get(str(v), 0) for v in Verdict},
+        autopilot_counts=dict(loop.autopilot.counts),
+        track=track,
+        problems=tuple(_problems(frames_after, fixes_after, position, attitude, errors_after)),
+    )
+
+
+def _problems(
+    frames_after: int, fixes_after: int, position: list[float], attitude: list[float], autopilot: list[float]
+) -> list[str]:
+    problems = []
+    if fixes_after < MIN_FIXES or fixes_after < MIN_FIXED_FRACTION * frames_after:
+        problems.append(
+            f"{fixes_after} of {frames_after} frames after GNSS was lost gave a fix; at least {MIN_FIXES} and "
+            f"{MIN_FIXED_FRACTION:.0%} must"
+        )
+    if position and max(position) > MAX_FIX_ERROR_M:
+        problems.append(f"a fix was {max(position):.1f} m off; limit {MAX_FIX_ERROR_M:.0f} m")
+    if attitude and max(attitude) > MAX_FIX_ERROR_DEG:
+        problems.append(f"a fix was {max(attitude):.1f} degrees off; limit {MAX_FIX_ERROR_DEG:.0f} degrees")
+    if not autopilot:
+        problems.append("the flight ended before GNSS was lost")
+    elif max(autopilot) > MAX_AUTOPILOT_ERROR_M:
+        problems.append(
+            f"the autopilot's position was {max(autopilot):.1f} m off after GNSS was lost; limit "
+            f"{MAX_AUTOPILOT_ERROR_M:.0f} m"
+        )
+    return problems
+
+
+_TRUTH, _ESTIMATE, _FIX = (255, 255, 255), (255, 210, 0), (255, 60, 60)
+
+
+def draw_track(report: FlightReport, pack: Pack, path: Path) -> None:
+    """Draw truth, the autopilot's estimate and the fixes over the orthophoto as PNG.
+
+    Raises: MapError if the file can't be written.
+    """
+    with MapStore(pack) as store:
+        window = store.read(store.bounds, max(store.dop_grids[0].gsd_m, (store.bounds[2] - store.bounds[0]) / 1300.0))
+    if window is None:
+        raise MapError(f"area pack {pack.path}: empty; build it again")
+    grid, track = window.dop_grid, report.track
+    # Dimmed, so that lines stand out on any ground.
+    picture = np.ascontiguousarray((window.dop * 0.62 + 20).astype(np.uint8))
+
+    def px(points_map: FloatArray) -> Any:
+        return np.round(grid.px_from_map(points_map[:, :2]) * 16).astype(np.int32)
+
+    def line(points_map: FloatArray, colour: tuple[int, int, int], width: int) -> None:
+        cv2.polylines(picture, [px(points_map)], False, (0, 0, 0), width + 2, cv2.LINE_AA, 4)
+        cv2.polylines(picture, [px(points_map)], False, colour, width, cv2.LINE_AA, 4)
+
+    line(track.truth_map_m, _TRUTH, 2)
+    line(track.estimate_map_m, _ESTIMATE, 1)
+    for spot in px(track.fix_map_m):
+        cv2.circle(picture, spot.tolist(), 4 * 16, (0, 0, 0), -1, cv2.LINE_AA, 4)
+        cv2.circle(picture, spot.tolist(), 3 * 16, _FIX, -1, cv2.LINE_AA, 4)
+    lost = int(np.searchsorted(track.t_s, report.gnss_lost_s))
+    if lost < len(track.t_s):
+        spot = px(track.truth_map_m[lost : lost + 1])[0]
+        cv2.drawMarker(picture, (spot // 16).tolist(), (0, 255, 255), cv2.MARKER_TILTED_CROSS, 16, 3)
+    _furniture(picture, grid.gsd_m, pack.georeference.convergence_rad(pack.georeference.anchor), report)
+    if not cv2.imwrite(str(path), picture[..., ::-1]):
+        raise MapError(f"picture {path}: can't be written; check that its directory exists and has room")
+
+
+def _furniture(picture: ImageArray, gsd_m: float, convergence_rad: float, report: FlightReport) -> None:
+    """Legend, scale bar, north arrow."""
+
+    def text(words: str, at: tuple[int, int]) -> None:
+        # OpenCV spaces thick letters wider than thin ones, so a dark outline would not lie under its text.
+        (wide, high), below = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
+        cv2.rectangle(picture, (at[0] - 3, at[1] - high - 3), (at[0] + wide + 3, at[1] + below), (24, 24, 24), -1)
+        cv2.putText(picture, words, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+
+    rows = (
+        (_TRUTH, "truth"),
+        (_ESTIMATE, f"autopilot, max error {report.autopilot_error_m.max:.1f} m"),
+        (_FIX, f"{report.fixes} fixes, median error {report.position_m.median:.2f} m"),
+        ((0, 255, 255), f"GNSS lost at {report.gnss_lost_s:.0f} s; dead reckoning alone "
+                        f"{report.final_dead_reckoning_error_m:.0f} m off at the end"),
+    )  # fmt: skip
+    for i, (colour, words) in enumerate(rows):
+        y = 24 + 20 * i
+        cv2.line(picture, (12, y - 5), (36, y - 5), colour, 3, cv2.LINE_AA)
+        text(words, (44, y))
+    height, width = picture.shape[:2]
+    bar = round(100.0 / gsd_m)
+    cv2.line(picture, (16, height - 20), (16 + bar, height - 20), (0, 0, 0), 6)
+    cv2.line(picture, (16, height - 20), (16 + bar, height - 20), (255, 255, 255), 3)
+    text("100 m", (16, height - 28))
+    # Up in the picture is grid north; the arrow points to true north.
+    foot = np.array([width - 34.0, 74.0])
+    tip = foot + 48.0 * np.array([-np.sin(convergence_rad), -np.cos(convergence_rad)])
+    for colour, thickness in (((0, 0, 0), 5), ((255, 255, 255), 2)):
+        cv2.arrowedLine(
+            picture, foot.astype(int).tolist(), tip.astype(int).tolist(), colour, thickness, cv2.LINE_AA, 0, 0.25
+        )
+    text("N", (width - 40, 92))

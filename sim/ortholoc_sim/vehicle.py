@@ -1,0 +1,166 @@
+"""A multirotor as a point with an attitude, and the guidance that flies a route by whatever estimate it is given.
+
+Frames: NED with true north from the world's anchor, m; body FRD. The vehicle is integrated at a fixed step.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ortholoc_edge.geometry import rotation
+from ortholoc_edge.geometry.arrays import FloatArray
+
+GRAVITY_M_S2 = 9.80665
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleOptions:
+    """How it flies.
+
+    Attributes:
+        max_acceleration_m_s2: horizontal; with the drag it sets the tilt.
+        drag_per_s: acceleration against the air per speed through it.
+        tilt_time_s: of the attitude's first-order response.
+        yaw_rate_rad_s: limit.
+        wind_ned_m_s: mean wind. gust_m_s, gust_time_s: 1-sigma per axis and correlation time of gusts.
+    """
+
+    max_acceleration_m_s2: float = 2.5
+    drag_per_s: float = 0.10
+    tilt_time_s: float = 0.18
+    yaw_rate_rad_s: float = 0.8
+    velocity_gain_per_s: float = 1.4
+    wind_ned_m_s: tuple[float, float, float] = (1.5, -1.0, 0.0)
+    gust_m_s: float = 0.6
+    gust_time_s: float = 4.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """Where the vehicle really is: (3,) m and m/s NED, ``ned_from_body`` (3, 3), body rates rad/s (3,)."""
+
+    position_ned_m: FloatArray
+    velocity_ned_m_s: FloatArray
+    ned_from_body: FloatArray
+    rates_body_rad_s: FloatArray
+
+
+@dataclass(slots=True)
+class Vehicle:
+    """State of the flight dynamics; `step` moves it on."""
+
+    options: VehicleOptions
+    position_ned_m: FloatArray
+    velocity_ned_m_s: FloatArray
+    yaw_rad: float
+    seed: int = 0
+    _down: FloatArray = field(init=False)
+    _gust: FloatArray = field(init=False)
+    _rng: np.random.Generator = field(init=False)
+    _rates: FloatArray = field(init=False)
+    _attitude: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._rng = np.random.default_rng([self.seed, 21])
+        self._gust = np.zeros(3)
+        self._down = np.array([0.0, 0.0, 1.0])
+        self._rates = np.zeros(3)
+        self._attitude = rotation.from_euler(0.0, 0.0, self.yaw_rad)
+
+    @property
+    def truth(self) -> Truth:
+        """A copy of the present state."""
+        return Truth(
+            self.position_ned_m.copy(), self.velocity_ned_m_s.copy(), self._attitude.copy(), self._rates.copy()
+        )
+
+    def step(self, dt_s: float, velocity_error_ned_m_s: FloatArray, yaw_error_rad: float) -> None:
+        """Fly for ``dt_s`` so as to remove an error of velocity and of heading (wanted minus estimated)."""
+        o = self.options
+        decay = float(np.exp(-dt_s / o.gust_time_s))
+        spread = o.gust_m_s * np.sqrt(1.0 - decay**2) * np.array([1.0, 1.0, 0.4])
+        self._gust = decay * self._gust + spread * self._rng.standard_normal(3)
+        air = self.velocity_ned_m_s - np.array(o.wind_ned_m_s) - self._gust
+        drag = -o.drag_per_s * air
+        wanted = o.velocity_gain_per_s * velocity_error_ned_m_s
+        flat = float(np.hypot(wanted[0], wanted[1]))
+        if flat > o.max_acceleration_m_s2:
+            wanted[:2] *= o.max_acceleration_m_s2 / flat
+        wanted[2] = float(np.clip(wanted[2], -2.5, 2.5))
+        # The controller counters the mean drag; gusts it meets only through the velocity error.
+        thrust = wanted + o.drag_per_s * (self.velocity_ned_m_s - np.array(o.wind_ned_m_s))
+        thrust[2] -= GRAVITY_M_S2
+        direction = -thrust / np.linalg.norm(thrust)
+        blend = 1.0 - float(np.exp(-dt_s / o.tilt_time_s))
+        self._down = self._down + blend * (direction - self._down)
+        self._down /= np.linalg.norm(self._down)
+        # Thrust acts along the body's axis as it is now, with the wanted vertical part.
+        lift = thrust[2] / -self._down[2]
+        acceleration = -self._down * lift + drag
+        acceleration[2] += GRAVITY_M_S2
+        self.position_ned_m = self.position_ned_m + self.velocity_ned_m_s * dt_s + 0.5 * acceleration * dt_s**2
+        self.velocity_ned_m_s = self.velocity_ned_m_s + acceleration * dt_s
+        turn = float(np.clip(1.5 * yaw_error_rad, -o.yaw_rate_rad_s, o.yaw_rate_rad_s))
+        self.yaw_rad = wrapped(self.yaw_rad + turn * dt_s)
+        before = self._attitude
+        self._attitude = attitude_of(self._down, self.yaw_rad)
+        self._rates = rotation.log(before.T @ self._attitude) / dt_s
+
+
+def attitude_of(body_down_ned: FloatArray, yaw_rad: float) -> FloatArray:
+    """``ned_from_body`` whose z axis is ``body_down_ned`` (unit) and whose nose points to ``yaw_rad``."""
+    nose = np.array([np.cos(yaw_rad), np.sin(yaw_rad), 0.0])
+    right = np.cross(body_down_ned, nose)
+    right /= np.linalg.norm(right)
+    return np.stack([np.cross(right, body_down_ned), right, body_down_ned], axis=1)
+
+
+def wrapped(angle_rad: float) -> float:
+    """To -pi..pi."""
+    return float((angle_rad + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+@dataclass(slots=True)
+class Guidance:
+    """Flies along waypoints (N, 3) NED in the autopilot's local frame at ``speed_m_s``; hovers over the last.
+
+    Corners are cut by aiming at a point ``lookahead_m`` ahead on the route.
+    """
+
+    waypoints_ned_m: FloatArray
+    speed_m_s: float
+    climb_m_s: float = 2.5
+    lookahead_m: float = 12.0
+    leg: int = 0
+
+    def wanted(self, position_ned_m: FloatArray) -> tuple[FloatArray, float]:
+        """Velocity (3,) NED m/s and heading (rad, true) for an estimated position."""
+        points = self.waypoints_ned_m
+        while self.leg < len(points) - 2 and self._along(position_ned_m) > self._length() - 0.5 * self.lookahead_m:
+            self.leg += 1
+        start, end = points[self.leg], points[self.leg + 1]
+        length = self._length()
+        course = (end - start) / max(length, 1e-6)
+        along = self._along(position_ned_m)
+        aim = start + course * min(length, max(0.0, along) + self.lookahead_m)
+        to_aim = aim - position_ned_m
+        flat = float(np.hypot(to_aim[0], to_aim[1]))
+        speed = self.speed_m_s
+        if self.leg == len(points) - 2:  # brake for the end of the route
+            speed = min(speed, 0.4 * float(np.hypot(*(end - position_ned_m)[:2])))
+        velocity = np.zeros(3)
+        if flat > 1e-3:
+            velocity[:2] = to_aim[:2] / flat * speed
+        velocity[2] = float(np.clip(0.6 * to_aim[2], -self.climb_m_s, self.climb_m_s))
+        return velocity, float(np.arctan2(course[1], course[0]))
+
+    def _length(self) -> float:
+        start, end = self.waypoints_ned_m[self.leg], self.waypoints_ned_m[self.leg + 1]
+        return float(np.hypot(*(end - start)[:2]))
+
+    def _along(self, position_ned_m: FloatArray) -> float:
+        start, end = self.waypoints_ned_m[self.leg], self.waypoints_ned_m[self.leg + 1]
+        course = (end - start)[:2] / max(self._length(), 1e-6)
+        return float((position_ned_m - start)[:2] @ course)
