@@ -28,4 +28,6 @@ def local_scale(homography: npt.ArrayLike, px: npt.ArrayLike) -> float:
     area factor. NaN beyond the horizon."""
     u, v = np.asarray(px, dtype=np.float64)
     ahead = warp_points(homography, [[u, v], [u + 0.5, v], [u, v + 0.5]])
-    return float(np.sqrt(abs(np.linalg.det((ahead[1:] - ahead[0]) * 2.0))))
+    # By hand: numpy's determinant warns about NaN.
+    (a, b), (c, d) = (ahead[1:] - ahead[0]) * 2.0
+    return float(np.sqrt(abs(a * d - b * c)))
