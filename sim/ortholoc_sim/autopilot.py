@@ -178,9 +178,12 @@ class PositionFilter:
 
     def innovation(self, position_m: FloatArray, capture_ns: int, now_ns: int) -> tuple[FloatArray, FloatArray] | None:
         """(difference (2,), row of the measurement (2,)) for a position at ``capture_ns``; None if too old."""
-        index = bisect_right(self._history, capture_ns, key=lambda entry: entry[0]) - 1
-        if index < 0:
+        # The nearest step: half a step at 10 m/s is 5 cm.
+        after = bisect_right(self._history, capture_ns, key=lambda entry: entry[0])
+        if after == 0:
             return None
+        near = [i for i in (after - 1, after) if i < len(self._history)]
+        index = min(near, key=lambda i: abs(self._history[i][0] - capture_ns))
         age_s = max(0.0, (now_ns - capture_ns) / _S)
         past = self._history[index][1] + self.offset_m - self.drift_m_s * age_s
         return position_m - past, np.array([1.0, -age_s])

@@ -138,7 +138,7 @@ class Guidance:
     def wanted(self, position_ned_m: FloatArray) -> tuple[FloatArray, float]:
         """Velocity (3,) NED m/s and heading (rad, true) for an estimated position."""
         points = self.waypoints_ned_m
-        while self.leg < len(points) - 2 and self._along(position_ned_m) > self._length() - 0.5 * self.lookahead_m:
+        while self.leg < len(points) - 2 and self._along(position_ned_m) > self._length() - 1.2 * self.lookahead_m:
             self.leg += 1
         start, end = points[self.leg], points[self.leg + 1]
         length = self._length()

@@ -1,0 +1,205 @@
+"""The closed loop: flown by good estimates it stays on its route without GNSS, and without them it does not."""
+
+from __future__ import annotations
+
+import threading
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from ortholoc_sim import demo_pack_path
+from ortholoc_sim.autopilot import dialect
+from ortholoc_sim.flight import Bench, FlightOptions, draw_track, make_report, run_flight
+from ortholoc_sim.loop import ClosedLoop, LoopOptions
+from ortholoc_sim.site import Site
+from ortholoc_sim.vehicle import Vehicle, VehicleOptions, attitude_of
+from ortholoc_sim.world import WorldSpec
+
+from ortholoc_edge.adapters.camera import EndOfFrames
+from ortholoc_edge.adapters.estimates import VisionEstimate
+from ortholoc_edge.adapters.mavlink import FrameParser, LinkOptions, LinkProtocol
+from ortholoc_edge.geometry import rotation
+from ortholoc_edge.geometry.arrays import FloatArray
+from ortholoc_edge.pipeline.frame import Frame
+from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
+from ortholoc_edge.tiles.pack import Pack
+
+S = 1_000_000_000
+START = 5_000 * S
+
+
+def route(site: Site) -> FloatArray:
+    corners = np.array([[-150.0, -120.0], [90.0, -130.0], [170.0, 0.0], [110.0, 130.0], [-140.0, 130.0]])
+    return np.column_stack([corners + site.anchor_map_m[:2], np.full(5, site.anchor_map_m[2] + 90.0)])
+
+
+def flown(site: Site, seconds: float, *, estimates: bool, seed: int = 1, noise_m: float = 0.8) -> ClosedLoop:
+    """Fly faster than real time against the daemon's own protocol, every message packed and parsed.
+
+    Estimates are the truth 0.4 s ago with noise, at 2 Hz.
+    """
+    loop = ClosedLoop(site, LoopOptions(route(site), seed=seed), START)
+    protocol = LinkProtocol(LinkOptions(endpoint="udp:127.0.0.1:1"))
+    ours, theirs = dialect.MAVLink(None, 1, 197), dialect.MAVLink(None, 1, 1)
+    from_autopilot, from_us = FrameParser(), FrameParser()
+    rng = np.random.default_rng(seed)
+    for tick in range(round(seconds * 50)):
+        now = START + tick * S // 50
+        out = loop.advance(now)
+        replies = [
+            answer
+            for sent in out
+            for message in from_autopilot.feed(sent.pack(theirs), now)
+            for answer in protocol.on_message(message, now)
+        ]
+        replies += protocol.poll(now)
+        taken = now - round(0.4 * S)
+        truth = loop.truth_at(taken)
+        if estimates and tick % 25 == 0 and truth is not None:
+            position = site.autopilot_from_ned(truth.position_ned_m) + rng.normal(0.0, noise_m, 3)
+            replies += protocol.encode_estimate(
+                VisionEstimate(taken, position, truth.ned_from_body, np.diag([noise_m**2] * 3 + [1e-4] * 3))
+            )
+        for reply in replies:
+            for answer in loop.receive(from_us.feed(reply.pack(ours), now), now):
+                for message in from_autopilot.feed(answer.pack(theirs), now):
+                    protocol.on_message(message, now)
+    return loop
+
+
+def errors_after(loop: ClosedLoop) -> FloatArray:
+    after = [s for s in loop.samples if s.stamp_ns > loop.gnss_lost_ns]
+    return np.array([np.hypot(*(s.estimate_m - s.true_m)[:2]) for s in after])
+
+
+def off_route(loop: ClosedLoop, site: Site) -> FloatArray:
+    """Horizontal distance in m from the route's polyline after GNSS was lost."""
+    corners = site.ned_from_map(route(site))[:, :2]
+    dense = np.vstack([a + np.linspace(0, 1, 200)[:, None] * (b - a) for a, b in pairwise(corners)])
+    points = np.array([s.truth.position_ned_m[:2] for s in loop.samples if s.stamp_ns > loop.gnss_lost_ns])[::20]
+    return np.asarray(np.linalg.norm(points[:, None] - dense[None], axis=2).min(axis=1))
+
+
+def test_estimates_keep_it_on_its_route(site: Site) -> None:
+    loop = flown(site, 65.0, estimates=True)
+    assert errors_after(loop).max() < 3.0
+    # Corners are cut; that is flying, not drifting.
+    assert np.percentile(off_route(loop, site), 85) < 5.0
+    assert {record.verdict.value for record in loop.autopilot.vision} == {"standby", "fused"}
+    flown_m = np.linalg.norm(loop.samples[-1].truth.position_ned_m - loop.samples[0].truth.position_ned_m)
+    assert flown_m > 250
+
+
+def test_without_estimates_it_drifts_off(site: Site) -> None:
+    worst = [float(errors_after(flown(site, 65.0, estimates=False, seed=seed))[-1]) for seed in (1, 2)]
+    assert max(worst) > 4.0
+    assert min(worst) > 1.0
+
+
+def test_same_seed_same_flight(site: Site) -> None:
+    first, second = (flown(site, 8.0, estimates=True) for _ in range(2))
+    assert np.array_equal(first.samples[-1].truth.position_ned_m, second.samples[-1].truth.position_ned_m)
+    assert np.array_equal(first.samples[-1].estimate_m, second.samples[-1].estimate_m)
+
+
+def test_vehicle_tilts_into_its_acceleration() -> None:
+    calm = VehicleOptions(wind_ned_m_s=(0.0, 0.0, 0.0), gust_m_s=0.0)
+    vehicle = Vehicle(calm, np.array([0.0, 0.0, -80.0]), np.zeros(3), 0.0)
+    for _ in range(60):
+        vehicle.step(0.01, np.array([9.0, 0.0, 0.0]) - vehicle.velocity_ned_m_s, 0.0)
+    _, pitch, _ = rotation.to_euler(vehicle.truth.ned_from_body)
+    assert np.rad2deg(pitch) == pytest.approx(-14.0, abs=3.0)  # nose down, atan(2.5 / 9.8)
+    for _ in range(2000):
+        vehicle.step(0.01, np.array([9.0, 0.0, 0.0]) - vehicle.velocity_ned_m_s, 0.0)
+    assert vehicle.velocity_ned_m_s == pytest.approx([9.0, 0.0, 0.0], abs=0.1)
+    _, pitch, _ = rotation.to_euler(vehicle.truth.ned_from_body)
+    assert np.rad2deg(pitch) == pytest.approx(-5.2, abs=0.5)  # against the drag: atan(0.9 / 9.8)
+    assert vehicle.position_ned_m[2] == pytest.approx(-80.0, abs=0.5)
+
+
+def test_attitude_has_its_nose_where_yaw_says() -> None:
+    attitude = attitude_of(np.array([0.0, 0.0, 1.0]), 0.7)
+    assert rotation.to_euler(attitude) == pytest.approx((0.0, 0.0, 0.7))
+    assert np.linalg.det(attitude) == pytest.approx(1.0)
+
+
+# -- report ------------------------------------------------------------------
+
+
+def true_fix(loop: ClosedLoop, site: Site, options: FlightOptions, stamp_ns: int, east_m: float = 0.0) -> Fix:
+    """A fix at the truth, ``east_m`` true metres off."""
+    truth = loop.truth_at(stamp_ns)
+    assert truth is not None
+    pose = site.camera_pose(truth.position_ned_m, truth.ned_from_body, options.mount.body_from_camera())
+    moved = type(pose)(pose.rotation, pose.translation + np.array([east_m * site.grid_scale, 0.0, 0.0]))
+    return Fix(
+        stamp_ns=stamp_ns,
+        map_from_camera=moved,
+        camera=options.camera,
+        covariance=np.eye(6),
+        quality=0.9,
+        matches=100,
+        inliers=80,
+        rms_px=1.0,
+        adhop_accepted=None,
+        query_px=np.zeros((0, 2)),
+        points_map=np.zeros((0, 3)),
+    )
+
+
+def test_report_reads_errors_as_they_are(site: Site, tmp_path: Path) -> None:
+    options = FlightOptions()
+    loop = flown(site, 25.0, estimates=True)
+    stamps = range(START + 3 * S, START + 24 * S, S // 2)
+    outcomes: list[tuple[int, Outcome]] = [
+        (stamp + S // 4, true_fix(loop, site, options, stamp, 1.0)) for stamp in stamps
+    ]
+    outcomes.append((START + 24 * S, Rejected(START + 23 * S, Reason.FEW_MATCHES)))
+    report = make_report(loop, site, options, outcomes, frames=50)
+    assert report.passed, report.problems
+    assert report.horizontal_m.median == pytest.approx(1.0, abs=1e-6)
+    assert report.attitude_deg.max == pytest.approx(0.0, abs=1e-6)
+    assert report.latency_ms.median == pytest.approx(250.0)
+    assert report.rejections == {"few_matches": 1}
+    assert report.frames_after == 29
+    assert report.summary()["passed"] is True
+    draw_track(report, Pack.open(demo_pack_path()), tmp_path / "track.png")
+    picture = cv2.imread(str(tmp_path / "track.png"))
+    assert picture is not None
+    assert picture.shape[1] >= 600
+    wrong = [*outcomes, (START + 20 * S, true_fix(loop, site, options, START + 20 * S, 12.0))]
+    assert any("12.0 m off" in problem for problem in make_report(loop, site, options, wrong, 50).problems)
+    assert not make_report(loop, site, options, [], 50).passed
+
+
+def test_a_real_flight_shows_the_camera_what_the_vehicle_sees(tmp_path: Path) -> None:
+    """Five seconds of everything: process, threads, sockets; what is under test only looks."""
+    frames: list[Frame] = []
+
+    def look(bench: Bench):  # type: ignore[no-untyped-def]
+        def run() -> None:
+            while not bench.stop.is_set():
+                try:
+                    frame = bench.frames.read(0.2)
+                except EndOfFrames:
+                    return
+                if frame is not None:
+                    frames.append(frame)
+                    bench.on_outcome(Rejected(frame.stamp_ns, Reason.FEW_MATCHES))
+
+        return run
+
+    # The demo's own extent at a coarse texel: the world is made in a second.
+    options = FlightOptions(spec=WorldSpec(gsd_m=0.5), duration_s=5.0, gnss_until_s=1.0)
+    report = run_flight(options, look)
+    assert len(frames) >= 3
+    assert frames[0].image.shape == (480, 640, 3)
+    assert frames[0].image.std() > 15
+    stamps = np.diff([frame.stamp_ns for frame in frames])
+    assert (stamps % (S // 2) == 0).all()
+    assert report.rejections == {"few_matches": len(frames)}
+    assert not report.passed
+    assert "gave a fix" in report.problems[0]
+    assert threading.active_count() < 20
