@@ -64,7 +64,7 @@ def test_opencv_warps_take_integers_for_centres():
 
 def test_gdal_counts_from_the_corner_and_we_from_the_centre():
     grid = RasterGrid(10, 10, 100.0, 200.0, 2.0, -2.0)
-    affine = rasterio.transform.from_origin(100.0, 200.0, 2.0, 2.0)
+    affine = rasterio.transform.Affine(2.0, 0.0, 100.0, 0.0, -2.0, 200.0)
     assert rasterio.transform.xy(affine, 4.5, 2.5, offset="ul") == pytest.approx((105.0, 191.0))
     assert np.allclose(grid.px_from_map([105.0, 191.0]), [2.0, 4.0])
 
