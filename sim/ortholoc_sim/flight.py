@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import select
+import signal
 import threading
 from collections import Counter
 from collections.abc import Callable
@@ -219,15 +220,16 @@ class _Studio:
 
 def _draw(studio: _Studio, pipe: Connection) -> None:
     """Main of the drawing process: poses come in, pictures go out, until the pipe closes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the flight, and the flight ends this process
     cv2.setNumThreads(1)
     renderer = Renderer(build_scene(generate(studio.spec), studio.epoch), studio.placement, studio.sensor)
-    pipe.send("ready")
-    while True:
-        try:
+    try:
+        pipe.send("ready")
+        while True:
             pose, seed = pipe.recv()
             pipe.send(renderer.render(studio.camera, pose, seed))
-        except (EOFError, OSError):
-            return
+    except (EOFError, OSError):
+        return
 
 
 class SimulatedCamera:
