@@ -5,6 +5,7 @@ Each test returns None, or a `Refusal` that says what was measured against which
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -124,7 +125,7 @@ def agrees_with(
 ) -> Refusal | None:
     """Tilt against gravity, then heading, then position against what was predicted."""
     limit = options.max_innovation_sigmas
-    turn = rotation.log(map_from_camera.rotation @ prior.map_from_camera.rotation.T)
+    turn = _tilt_and_heading(map_from_camera.rotation @ prior.map_from_camera.rotation.T)
     spread = prior.covariance + covariance
     tilt = float(np.sqrt(mahalanobis_squared(turn[:2], spread[3:5, 3:5])))
     if tilt > limit:
@@ -144,3 +145,16 @@ def agrees_with(
             limit,
         )
     return None
+
+
+def _tilt_and_heading(turn: FloatArray) -> FloatArray:
+    """(3,) rad: a turn (3, 3) as a tilt about level axes, followed by a turn about the vertical.
+
+    For small turns that is the rotation vector; but under a large turn of the heading, as with a prior that does
+    not know it, the rotation vector makes up to pi / 2 times the tilt of a tilt. The axes are the prior's.
+    """
+    x, y, z = turn[2]
+    sine = math.hypot(x, y)
+    tilt = np.array([y, -x, 0.0]) * (math.atan2(sine, z) / sine if sine > 1e-12 else 1.0)
+    level = turn @ rotation.exp(-tilt)
+    return np.array([tilt[0], tilt[1], math.atan2(level[1, 0], level[0, 0])])
