@@ -103,7 +103,10 @@ class Tracker:
     def update(self, outcome: Outcome, state: VehicleState) -> None:
         """Learn from what the frame of the last `predict` came to."""
         if isinstance(outcome, Rejected):
-            if self._anchor is not None:
+            if outcome.reason is Reason.NO_PRIOR:
+                # Lost: what comes next is a new start, and the autopilot must hear of it as one.
+                self.status = TrackerStatus.SEARCH
+            elif self.status is not TrackerStatus.SEARCH:
                 self.status = TrackerStatus.COAST
             return
         if self.status is TrackerStatus.SEARCH or self._jumped(outcome):
@@ -162,6 +165,9 @@ class Tracker:
         if position is None or not np.isfinite(position).all():
             return None
         horizontal_m, vertical_m = state.position_sigma_m
+        # Of NaN, eigvalsh makes zero: the most certain position of all.
+        if not (math.isfinite(horizontal_m) and math.isfinite(vertical_m)):
+            return None
         return position, np.diag(np.square([horizontal_m, horizontal_m, vertical_m]))
 
 
