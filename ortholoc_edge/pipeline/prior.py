@@ -9,6 +9,7 @@ import numpy as np
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import FloatArray, frozen_floats
 from ortholoc_edge.geometry.camera import Camera
+from ortholoc_edge.geometry.covariance import mahalanobis_squared
 from ortholoc_edge.geometry.rigid import Rigid3
 
 Bounds = tuple[float, float, float, float]
@@ -125,13 +126,19 @@ def hypotheses(prior: PosePrior, footprint_m: float) -> list[PosePrior]:
         covariance[5, :5] = covariance[:5, 5] = 0.0
         covariance[5, 5] = (_HEADING_STEP_RAD / 2.0) ** 2
     pose = prior.map_from_camera
+    # Both lists are sorted and sorting is stable: ties keep the nearer position first.
+    pairs = sorted(
+        ((offset, turn) for offset in offsets for turn in headings),
+        key=lambda pair: (
+            mahalanobis_squared(pair[0], prior.covariance[:2, :2]) + (pair[1] / prior.heading_sigma_rad) ** 2
+        ),
+    )
     return [
         PosePrior(
             Rigid3(rotation.exp([0.0, 0.0, turn]) @ pose.rotation, pose.translation + np.append(offset, 0.0)),
             covariance,
         )
-        for offset in offsets
-        for turn in headings
+        for offset, turn in pairs
     ]
 
 
