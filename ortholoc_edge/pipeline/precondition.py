@@ -36,7 +36,8 @@ class ReferenceView:
     Attributes:
         image: (H, W) uint8 grey.
         valid: (H, W) bool, False where it shows no map.
-        view_from_dop: (3, 3) homography from the window's DOP pixels to this picture's.
+        view_from_dop: (3, 3) homography from the window's DOP pixels to this picture's; its third coordinate is
+            positive for what lies in front of the camera.
         margin_px: of a predicted view, by which it shows more than the camera on every side.
         max_shift_px: of a predicted view, how far from where it is predicted a thing may lie in the frame, both
             at the working size; infinite where nothing is predicted.
@@ -50,10 +51,9 @@ class ReferenceView:
 
     def dop_px(self, view_px: FloatArray) -> FloatArray:
         """DOP pixels (N, 2) of pixels of this picture; AdHoP's inverse mapping."""
-        inverse: FloatArray = np.asarray(np.linalg.inv(self.view_from_dop), dtype=np.float64)
-        # The sign of a homography is free; here it makes what the picture shows positive.
-        centre = (np.array(self.image.shape[::-1]) - 1) / 2
-        return homography.warp_points(homography.positive_at(inverse, centre), view_px)
+        # The inverse inherits the sign: what is in front stays positive, even where the horizon lies below the
+        # middle of the picture.
+        return homography.warp_points(np.linalg.inv(self.view_from_dop), view_px)
 
 
 def grey_map(window: MapWindow) -> ImageArray:
