@@ -20,6 +20,8 @@ from __future__ import annotations
 
 import csv
 import datetime
+import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -93,19 +95,11 @@ def read_flight(folder: Path) -> list[RecordedFrame]:
             f"{folder}: {len(tables)} files named *_flight.csv, expected one; the format is described in "
             "docs/sequences.md"
         )
-    recorded: list[RecordedFrame] = []
-    start: datetime.datetime | None = None
-    with tables[0].open(newline="", encoding="utf-8") as lines:
-        for number, row in enumerate(csv.DictReader(lines), start=2):
-            if not row.get("filename"):
-                continue
-            where = f"{tables[0]}, line {number}"
-            when = _time(row, where)
-            start = start or when
-            stamp_ns = round((when - start).total_seconds() * 1e9)
-            if recorded and stamp_ns <= recorded[-1].stamp_ns:
-                stamp_ns = recorded[-1].stamp_ns + _EQUAL_STAMP_STEP_NS
-            recorded.append(_recorded(row, where, folder, stamp_ns))
+    try:
+        with tables[0].open(newline="", encoding="utf-8") as lines:
+            recorded = _rows(csv.DictReader(lines), tables[0], folder)
+    except (OSError, UnicodeDecodeError, csv.Error) as err:
+        raise DatasetError(f"{tables[0]}: not a readable CSV file ({err})") from err
     if not recorded:
         raise DatasetError(f"{tables[0]}: no row names a photo")
     return recorded
@@ -121,16 +115,47 @@ def sample_paths(source: Path) -> list[Path]:
 def read_sample(path: Path) -> Sample:
     """An OrthoLoC sample. Raises: DatasetError naming the file and the key."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            return _sample(archive, path)
+        # Opened here: of a damaged archive, np.load leaves its own file open.
+        with path.open("rb") as file:
+            archive = np.load(file, allow_pickle=False)
+            if not isinstance(archive, np.lib.npyio.NpzFile):
+                raise DatasetError(f"{path}: a single array, expected an archive (.npz) of a sample's keys")
+            with archive:
+                return _sample(archive, path)
     except DatasetError:
         raise
-    except (OSError, ValueError, KeyError, EOFError) as err:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as err:
         raise DatasetError(f"{path}: not a readable OrthoLoC sample ({err}); copy it again") from err
 
 
+def _rows(reader: csv.DictReader[str], table: Path, folder: Path) -> list[RecordedFrame]:
+    recorded: list[RecordedFrame] = []
+    start: datetime.datetime | None = None
+    before: datetime.datetime | None = None
+    for row in reader:
+        where = f"{table}, line {reader.line_num}"
+        if "filename" not in row:
+            raise DatasetError(f"{where}: no column filename")
+        if not row["filename"]:
+            continue
+        when = _time(row, where)
+        start = start or when
+        if before is not None and when < before:
+            raise DatasetError(f"{where}: exif_time {row['exif_time']} is before the photo above's; sort the rows")
+        before = when
+        stamp_ns = round((when - start).total_seconds() * 1e9)
+        if recorded and stamp_ns <= recorded[-1].stamp_ns:
+            stamp_ns = recorded[-1].stamp_ns + _EQUAL_STAMP_STEP_NS
+        try:
+            recorded.append(_recorded(row, where, folder, stamp_ns))
+        except ValueError as err:
+            raise DatasetError(f"{where}: {err}") from err
+    return recorded
+
+
 def _time(row: dict[str, str], where: str) -> datetime.datetime:
-    text = row.get("exif_time", "")
+    # A row cut short has None there.
+    text = row.get("exif_time") or ""
     try:
         return datetime.datetime.strptime(text, "%Y:%m:%d %H:%M:%S")
     except ValueError as err:
