@@ -15,6 +15,8 @@ from ortholoc_edge.geometry.arrays import BoolArray, FloatArray
 from ortholoc_edge.geometry.grid import resize_px
 
 _UNDISTORT_ITERATIONS = 20
+# In units of the focal length: a millionth of a pixel.
+_UNDISTORT_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,12 +97,14 @@ class Camera:
         return xy * (self.fx, self.fy) + (self.cx, self.cy)
 
     def unproject(self, px: npt.ArrayLike) -> FloatArray:
-        """Pixels (..., 2) to rays (..., 3) in the camera frame with z = 1."""
+        """Pixels (..., 2) to rays (..., 3) in the camera frame with z = 1.
+
+        NaN in x and y where the distortion gives no ray: a polynomial fitted to the middle of a picture may fold
+        back before its corners.
+        """
         xy = (np.asarray(px, dtype=np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
         if not self.is_pinhole:
-            distorted, xy = xy, xy.copy()
-            for _ in range(_UNDISTORT_ITERATIONS):
-                xy += distorted - self._distorted(xy)
+            xy = self._undistorted(xy)
         return np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1)
 
     def undistorted_px(self, px: npt.ArrayLike) -> FloatArray:
@@ -118,6 +122,33 @@ class Camera:
             & (px[..., 1] >= -0.5)
             & (px[..., 1] <= self.height - 0.5)
         )
+
+    def _undistorted(self, distorted: FloatArray) -> FloatArray:
+        """Newton's method: the usual fixed point is a pixel off in the corners of a pincushion (k1 = 0.3)."""
+        k1, k2, p1, p2, k3 = self.distortion
+        xy = distorted.copy()
+        with np.errstate(all="ignore"):
+            for _ in range(_UNDISTORT_ITERATIONS):
+                x, y = xy[..., 0], xy[..., 1]
+                r2 = x * x + y * y
+                radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+                slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
+                xx = radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+                yy = radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+                mixed = slope * x * y + 2.0 * (p1 * x + p2 * y)
+                determinant = xx * yy - mixed * mixed
+                missing = distorted - self._distorted(xy)
+                step = np.stack(
+                    [
+                        yy * missing[..., 0] - mixed * missing[..., 1],
+                        xx * missing[..., 1] - mixed * missing[..., 0],
+                    ],
+                    axis=-1,
+                )
+                xy = xy + step / determinant[..., None]
+            # Of a folded polynomial the branch around the axis is the lens; beyond the fold the determinant falls.
+            solved = (np.abs(distorted - self._distorted(xy)).max(axis=-1) < _UNDISTORT_TOLERANCE) & (determinant > 0)
+        return np.where(solved[..., None], xy, np.nan)
 
     def _distorted(self, xy: FloatArray) -> FloatArray:
         k1, k2, p1, p2, k3 = self.distortion

@@ -20,7 +20,24 @@ def pixels_of(camera, part_u, part_v):
 @given(cameras(), finite(0, 1), finite(0, 1), finite(0.1, 5000.0))
 def test_unproject_then_project(camera, part_u, part_v, depth):
     px = pixels_of(camera, part_u, part_v)
-    assert np.allclose(camera.project(camera.unproject(px) * depth), px, rtol=0, atol=1e-3)
+    assert np.allclose(camera.project(camera.unproject(px) * depth), px, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("k1", [-0.25, 0.1, 0.3, 0.6])
+def test_corners_of_strong_lenses(k1):
+    camera = Camera(1280, 960, 700.0, 700.0, 639.5, 479.5, (k1, 0.05 if k1 < 0 else 0.0, 1e-3, -1e-3, 0.0))
+    corners = np.array([[-0.5, -0.5], [1279.5, -0.5], [1279.5, 959.5], [640.0, 100.0]])
+    assert np.allclose(camera.project(camera.unproject(corners)), corners, rtol=0, atol=1e-5)
+
+
+def test_pixels_that_no_ray_reaches_are_nan():
+    """r (1 - 0.4 r^2) never exceeds 0.61 focal lengths: the corners of this picture show nothing."""
+    camera = Camera(1280, 960, 700.0, 700.0, 639.5, 479.5, (-0.4, 0.0, 0.0, 0.0, 0.0))
+    rays = camera.unproject([[0.0, 0.0], [639.5, 479.5], [639.5 + 350.0, 479.5]])
+    assert np.isnan(rays[0, :2]).all()
+    assert np.allclose(rays[1], [0, 0, 1])
+    assert camera.project(rays[2]) == pytest.approx([989.5, 479.5], abs=1e-5)
+    assert not camera.contains(camera.undistorted_px([[0.0, 0.0]])).any()
 
 
 @given(cameras(distorted=False), finite(-2, 2), finite(-2, 2), finite(0.1, 5000.0))
