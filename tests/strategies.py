@@ -1,8 +1,13 @@
-"""Hypothesis strategies that several folders share: values over the ranges that occur on Earth and in cameras."""
+"""Hypothesis strategies that several folders share: values over the ranges that occur on Earth and in cameras.
+
+Importing this also makes hypothesis deterministic: the same examples in every run, and no time limit per example,
+which a busy machine would miss.
+"""
 
 from __future__ import annotations
 
 import numpy as np
+from hypothesis import settings
 from hypothesis import strategies as st
 
 from ortholoc_edge.geometry import rotation
@@ -10,6 +15,9 @@ from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.grid import RasterGrid
 from ortholoc_edge.geometry.rigid import Rigid3
+
+settings.register_profile("deterministic", derandomize=True, deadline=None)
+settings.load_profile("deterministic")
 
 # UTM northings reach 1e7 m.
 MAP_EXTENT_M = 1e7

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import strategies as st
+from strategies import finite
 
 from ortholoc_edge.bench import replay
 from ortholoc_edge.bench.replay import Length, PriorKind, PriorNoise, SimulatedAutopilot
@@ -143,9 +143,10 @@ def test_what_is_no_length_is_refused(text):
         Length.parse(text)
 
 
-@given(st.integers(0, 99_999), st.booleans())
-def test_lengths_print_as_they_are_read(tenths, relative):
-    length = Length(of_height=tenths / 1000) if relative else Length(metres=tenths / 10)
+@pytest.mark.parametrize("relative", [False, True])
+@given(value=finite(0.01, 99_999.0))
+def test_lengths_print_as_they_are_read(relative, value):
+    length = Length(of_height=value / 100) if relative else Length(metres=value)
     again = Length.parse(str(length))
-    assert again.metres == pytest.approx(length.metres)
-    assert again.of_height == pytest.approx(length.of_height)
+    assert again.metres == pytest.approx(length.metres, rel=1e-5)
+    assert again.of_height == pytest.approx(length.of_height, rel=1e-5)
