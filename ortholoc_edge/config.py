@@ -82,6 +82,7 @@ class MatcherOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     name: str = "xfeat"
     working_px: Annotated[int, Meta(ge=128, le=4096)] = 640
+    max_keypoints: Annotated[int, Meta(ge=64, le=16384)] = 4096
     threads: Annotated[int, Meta(ge=1, le=64)] = 1
     model: str | None = None
     model_sha256: str | None = None

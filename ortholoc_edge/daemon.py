@@ -129,6 +129,7 @@ class Daemon:
         self._matcher = matcher or make_matcher(
             options.name,
             working_px=options.working_px,
+            max_keypoints=options.max_keypoints,
             threads=options.threads,
             model_path=None if options.model is None else Path(options.model),
             model_sha256=options.model_sha256,

@@ -98,7 +98,8 @@ def track(store: MapStore, tracks: Sequence[Track], caption: str) -> ImageArray:
             cv2.polylines(canvas, [np.round(px).astype(np.int32)], False, one.colour, 2, cv2.LINE_AA)
         if not one.joined:
             _dots(canvas, px, one.colour, 4)
-    _furniture(canvas, grid, tracks)
+    georeference = store.pack.georeference
+    _furniture(canvas, grid, georeference.convergence_rad(georeference.anchor), tracks)
     return _captioned(canvas, caption)
 
 
@@ -134,15 +135,19 @@ def _captioned(canvas: ImageArray, caption: str) -> ImageArray:
     return np.vstack([strip, canvas])
 
 
-def _furniture(canvas: ImageArray, grid: RasterGrid, tracks: Sequence[Track]) -> None:
+def _furniture(canvas: ImageArray, grid: RasterGrid, convergence_rad: float, tracks: Sequence[Track]) -> None:
+    """Scale bar, arrow to true north (up is grid north) and legend."""
     height, width = canvas.shape[:2]
     bar_m = _round_length(0.2 * width * grid.dx)
     bar_px = round(bar_m / grid.dx)
     cv2.rectangle(canvas, (15, height - 45), (bar_px + 35, height - 8), _PAPER, -1)
     cv2.line(canvas, (25, height - 18), (25 + bar_px, height - 18), _INK, 3)
     cv2.putText(canvas, f"{bar_m:g} m", (25, height - 26), _FONT, 0.5, _INK, 1, cv2.LINE_AA)
-    cv2.arrowedLine(canvas, (width - 30, 70), (width - 30, 25), _INK, 3, cv2.LINE_AA, tipLength=0.35)
-    cv2.putText(canvas, "N", (width - 37, 90), _FONT, 0.6, _INK, 2, cv2.LINE_AA)
+    foot = np.array([width - 40.0, 74.0])
+    tip = foot + 48.0 * np.array([-math.sin(convergence_rad), -math.cos(convergence_rad)])
+    cv2.rectangle(canvas, (width - 62, 14), (width - 18, 98), _PAPER, -1)
+    cv2.arrowedLine(canvas, _at(foot), _at(tip), _INK, 3, cv2.LINE_AA, tipLength=0.35)
+    cv2.putText(canvas, "N", (width - 46, 92), _FONT, 0.6, _INK, 1, cv2.LINE_AA)
     widest = max((len(t.label) for t in tracks), default=0)
     cv2.rectangle(canvas, (10, 10), (50 + 10 * widest, 18 + 22 * len(tracks)), _PAPER, -1)
     for row, one in enumerate(tracks):

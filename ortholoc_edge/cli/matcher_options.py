@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from ortholoc_edge.cli.progress import ProgressBar
+from ortholoc_edge.config import MatcherOptions
 from ortholoc_edge.matching.registry import MATCHERS, make_matcher
 from ortholoc_edge.matching.types import Matcher
 
@@ -16,10 +17,25 @@ def add(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--working-px", type=int, default=640, help="long side at which images are matched, px (default: %(default)s)"
     )
+    group.add_argument(
+        "--max-keypoints", type=int, default=4096, help="per image; fewer are faster (default: %(default)s)"
+    )
     group.add_argument("--threads", type=int, default=1, help="threads of one inference (default: %(default)s)")
     group.add_argument("--model", type=Path, metavar="FILE", help="an ONNX file instead of the built model")
     group.add_argument("--model-sha256", metavar="HASH", help="refuse --model unless it has this SHA-256")
     group.add_argument("--no-adhop", action="store_true", help="one matching round only")
+
+
+def settings(args: argparse.Namespace) -> MatcherOptions:
+    """The arguments as the daemon's ``[matcher]`` table."""
+    return MatcherOptions(
+        name=args.matcher,
+        working_px=args.working_px,
+        max_keypoints=args.max_keypoints,
+        threads=args.threads,
+        model=None if args.model is None else str(args.model),
+        model_sha256=args.model_sha256,
+    )
 
 
 def matcher(args: argparse.Namespace) -> Matcher:
@@ -28,6 +44,7 @@ def matcher(args: argparse.Namespace) -> Matcher:
         return make_matcher(
             args.matcher,
             working_px=args.working_px,
+            max_keypoints=args.max_keypoints,
             threads=args.threads,
             model_path=args.model,
             model_sha256=args.model_sha256,

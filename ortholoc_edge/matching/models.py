@@ -231,7 +231,13 @@ def ensure(name: str, progress: Progress | None = None) -> StoredModel:
     Raises: ModelError from :func:`load` or :func:`build`.
     """
     known(name)
-    return load(name) if is_stored(name) else build(name, progress, only_if_absent=True)
+    if not is_stored(name):
+        return build(name, progress, only_if_absent=True)
+    stored = load(name)
+    # What another version of this program built from the same weights is no damage, only of no use.
+    entries = json.loads(_record_path(name).read_bytes())
+    current = entries.get("input_contract") == known(name).input_contract
+    return stored if current else build(name, progress)
 
 
 def build(

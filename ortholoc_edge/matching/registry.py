@@ -17,6 +17,7 @@ def make_matcher(
     name: str,
     *,
     working_px: int,
+    max_keypoints: int,
     threads: int,
     model_path: Path | None = None,
     model_sha256: str | None = None,
@@ -27,6 +28,7 @@ def make_matcher(
     Args:
         name: one of ``MATCHERS``.
         working_px: long side that images are brought to.
+        max_keypoints: per image.
         threads: of one inference; SIFT takes OpenCV's setting (``cv2.setNumThreads``).
         model_path: a model file instead of the store's.
         model_sha256: hash that the file must have; None: the record beside the file says it.
@@ -42,7 +44,7 @@ def make_matcher(
         if name == "sift":
             if model_path is not None:
                 raise ConfigError(f"matcher 'sift' uses no model; leave {model_path} away")
-            return SiftMatcher(working_px=working_px)
+            return SiftMatcher(working_px=working_px, max_keypoints=max_keypoints)
         # Not at the top: SIFT must work where the inference runtime does not.
         from ortholoc_edge.matching.xfeat import XFeatMatcher
 
@@ -51,6 +53,8 @@ def make_matcher(
             if model_path is None
             else models.load_file(model_path, model_sha256)
         )
-        return XFeatMatcher(model.graph, model.sha256, working_px=working_px, threads=threads)
+        return XFeatMatcher(
+            model.graph, model.sha256, working_px=working_px, max_keypoints=max_keypoints, threads=threads
+        )
     except ValueError as err:
         raise ConfigError(f"matcher {name}: {err}") from err

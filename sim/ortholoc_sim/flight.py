@@ -14,26 +14,30 @@ import signal
 import threading
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 
 from ortholoc_edge.adapters.camera import CameraOptions, EndOfFrames
 from ortholoc_edge.adapters.mavlink import LinkOptions
+from ortholoc_edge.bench import draw
+from ortholoc_edge.bench.metrics import Spread
 from ortholoc_edge.clock import Clock, SystemClock
 from ortholoc_edge.config import Config, Intrinsics, MapOptions, MatcherOptions, MountOptions
 from ortholoc_edge.daemon import Daemon
 from ortholoc_edge.errors import CameraError, MapError, OrtholocError
 from ortholoc_edge.geometry import rotation
-from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
+from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.frame import Frame
+from ortholoc_edge.pipeline.localizer import LocalizerOptions
 from ortholoc_edge.pipeline.outcome import Fix, Outcome
 from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.store import MapStore
@@ -70,7 +74,7 @@ class FlightOptions:
         frame_rate_hz: of the camera.
         camera, mount: the one on board.
         seed: of sensor errors, wind and noise.
-        matcher: of the daemon.
+        matcher, localizer: of the daemon.
     """
 
     pack: Path | None = None
@@ -94,7 +98,8 @@ class FlightOptions:
     vehicle: VehicleOptions = field(default_factory=VehicleOptions)
     autopilot: AutopilotOptions = field(default_factory=AutopilotOptions)
     seed: int = 1
-    matcher: MatcherOptions = field(default_factory=lambda: MatcherOptions(threads=1))
+    matcher: MatcherOptions = field(default_factory=MatcherOptions)
+    localizer: LocalizerOptions = field(default_factory=LocalizerOptions)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,21 +126,6 @@ class Bench:
 
 # Prepares (loads models, opens the map) and returns what to run once the vehicle is in the air.
 UnderTest = Callable[[Bench], Callable[[], None]]
-
-
-@dataclass(frozen=True, slots=True)
-class Spread:
-    """Median, 90th percentile and maximum; NaN of nothing."""
-
-    median: float
-    p90: float
-    max: float
-
-    @staticmethod
-    def of(values: list[float]) -> Spread:
-        if not values:
-            return Spread(float("nan"), float("nan"), float("nan"))
-        return Spread(*(float(v) for v in np.percentile(values, [50, 90, 100])))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,7 +178,7 @@ class FlightReport:
     latency_ms: Spread
     autopilot_error_m: Spread
     dead_reckoning_error_m: Spread
-    final_dead_reckoning_error_m: float
+    final_dead_reckoning_error_m: float | None
     vision: dict[str, int]
     autopilot_counts: dict[str, int]
     track: Track
@@ -200,8 +190,8 @@ class FlightReport:
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: all but the track."""
-        plain = {k: v for k, v in asdict(replace(self, track=None)).items() if k != "track"}  # type: ignore[arg-type]
-        return {"passed": self.passed, **plain}
+        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "track"}
+        return {"passed": self.passed, **msgspec.to_builtins(plain)}
 
 
 # -- the camera --------------------------------------------------------------
@@ -325,7 +315,7 @@ class SimulatedCamera:
 # -- the flight --------------------------------------------------------------
 
 
-def daemon_under_test(matcher: MatcherOptions) -> UnderTest:
+def daemon_under_test(matcher: MatcherOptions, localizer: LocalizerOptions) -> UnderTest:
     """The real daemon, in this process, configured for the bench's camera, pack and autopilot."""
 
     def prepare(bench: Bench) -> Callable[[], None]:
@@ -340,6 +330,7 @@ def daemon_under_test(matcher: MatcherOptions) -> UnderTest:
             link=LinkOptions(endpoint=bench.endpoint),
             mount=bench.mount,
             matcher=matcher,
+            localizer=localizer,
         )  # fmt: skip
         daemon = Daemon(config, frames=bench.frames, on_outcome=lambda _, outcome: bench.on_outcome(outcome))
         return lambda: daemon.run(bench.stop)
@@ -380,7 +371,7 @@ def run_flight(options: FlightOptions, under_test: UnderTest | None = None, cloc
     port = UdpPort(options.autopilot.system_id)
     try:
         # The world is made in the camera's process meanwhile.
-        run = (under_test or daemon_under_test(options.matcher))(
+        run = (under_test or daemon_under_test(options.matcher, options.localizer))(
             Bench(
                 path, options.camera, options.mount, camera, f"udpout:127.0.0.1:{port.port}", stop,
                 lambda outcome: outcomes.append((clock.now_ns(), outcome)),
@@ -535,7 +526,7 @@ def make_report(
         latency_ms=Spread.of(latency),
         autopilot_error_m=Spread.of(errors_after),
         dead_reckoning_error_m=Spread.of([float(v) for v in known]),
-        final_dead_reckoning_error_m=float(known[-1]) if len(known) else float("nan"),
+        final_dead_reckoning_error_m=float(known[-1]) if len(known) else None,
         vision={str(v): vision.get(str(v), 0) for v in Verdict},
         autopilot_counts=dict(loop.autopilot.counts),
         track=track,
@@ -566,73 +557,27 @@ def _problems(
     return problems
 
 
-_TRUTH, _ESTIMATE, _FIX = (255, 255, 255), (255, 210, 0), (255, 60, 60)
-
-
 def draw_track(report: FlightReport, pack: Pack, path: Path) -> None:
-    """Draw truth, the autopilot's estimate and the fixes over the orthophoto as PNG.
+    """Draw truth, the autopilot's estimate, the fixes and where GNSS was lost over the orthophoto, as PNG.
 
-    Raises: MapError if the file can't be written.
+    Raises: OrtholocError if the file can't be written.
     """
+    track = report.track
+    lost = np.searchsorted(track.t_s, report.gnss_lost_s)
+    tracks = [
+        draw.Track("truth", track.truth_map_m[:, :2], draw.TRUTH),
+        draw.Track("autopilot", track.estimate_map_m[:, :2], draw.PRIOR),
+        draw.Track("fix", track.fix_map_m[:, :2], draw.ESTIMATE, joined=False),
+        draw.Track("GNSS lost", track.truth_map_m[lost : lost + 1, :2], draw.DIFFERENCE, joined=False),
+    ]
+    caption = (
+        f"{report.fixes} fixes, median error {_metres(report.position_m.median)}; after GNSS was lost the autopilot "
+        f"was at most {_metres(report.autopilot_error_m.max)} off, by dead reckoning alone "
+        f"{_metres(report.final_dead_reckoning_error_m)} at the end"
+    )
     with MapStore(pack) as store:
-        window = store.read(store.bounds, max(store.dop_grids[0].gsd_m, (store.bounds[2] - store.bounds[0]) / 1300.0))
-    if window is None:
-        raise MapError(f"area pack {pack.path}: empty; build it again")
-    grid, track = window.dop_grid, report.track
-    # Dimmed, so that lines stand out on any ground.
-    picture = np.ascontiguousarray((window.dop * 0.62 + 20).astype(np.uint8))
-
-    def px(points_map: FloatArray) -> Any:
-        return np.round(grid.px_from_map(points_map[:, :2]) * 16).astype(np.int32)
-
-    def line(points_map: FloatArray, colour: tuple[int, int, int], width: int) -> None:
-        cv2.polylines(picture, [px(points_map)], False, (0, 0, 0), width + 2, cv2.LINE_AA, 4)
-        cv2.polylines(picture, [px(points_map)], False, colour, width, cv2.LINE_AA, 4)
-
-    line(track.truth_map_m, _TRUTH, 2)
-    line(track.estimate_map_m, _ESTIMATE, 1)
-    for spot in px(track.fix_map_m):
-        cv2.circle(picture, spot.tolist(), 4 * 16, (0, 0, 0), -1, cv2.LINE_AA, 4)
-        cv2.circle(picture, spot.tolist(), 3 * 16, _FIX, -1, cv2.LINE_AA, 4)
-    lost = int(np.searchsorted(track.t_s, report.gnss_lost_s))
-    if lost < len(track.t_s):
-        spot = px(track.truth_map_m[lost : lost + 1])[0]
-        cv2.drawMarker(picture, (spot // 16).tolist(), (0, 255, 255), cv2.MARKER_TILTED_CROSS, 16, 3)
-    _furniture(picture, grid.gsd_m, pack.georeference.convergence_rad(pack.georeference.anchor), report)
-    if not cv2.imwrite(str(path), picture[..., ::-1]):
-        raise MapError(f"picture {path}: can't be written; check that its directory exists and has room")
+        draw.write_png(path, draw.track(store, tracks, caption))
 
 
-def _furniture(picture: ImageArray, gsd_m: float, convergence_rad: float, report: FlightReport) -> None:
-    """Legend, scale bar, north arrow."""
-
-    def text(words: str, at: tuple[int, int]) -> None:
-        # OpenCV spaces thick letters wider than thin ones, so a dark outline would not lie under its text.
-        (wide, high), below = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
-        cv2.rectangle(picture, (at[0] - 3, at[1] - high - 3), (at[0] + wide + 3, at[1] + below), (24, 24, 24), -1)
-        cv2.putText(picture, words, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
-
-    rows = (
-        (_TRUTH, "truth"),
-        (_ESTIMATE, f"autopilot, max error {report.autopilot_error_m.max:.1f} m"),
-        (_FIX, f"{report.fixes} fixes, median error {report.position_m.median:.2f} m"),
-        ((0, 255, 255), f"GNSS lost at {report.gnss_lost_s:.0f} s; dead reckoning alone "
-                        f"{report.final_dead_reckoning_error_m:.0f} m off at the end"),
-    )  # fmt: skip
-    for i, (colour, words) in enumerate(rows):
-        y = 24 + 20 * i
-        cv2.line(picture, (12, y - 5), (36, y - 5), colour, 3, cv2.LINE_AA)
-        text(words, (44, y))
-    height, width = picture.shape[:2]
-    bar = round(100.0 / gsd_m)
-    cv2.line(picture, (16, height - 20), (16 + bar, height - 20), (0, 0, 0), 6)
-    cv2.line(picture, (16, height - 20), (16 + bar, height - 20), (255, 255, 255), 3)
-    text("100 m", (16, height - 28))
-    # Up in the picture is grid north; the arrow points to true north.
-    foot = np.array([width - 34.0, 74.0])
-    tip = foot + 48.0 * np.array([-np.sin(convergence_rad), -np.cos(convergence_rad)])
-    for colour, thickness in (((0, 0, 0), 5), ((255, 255, 255), 2)):
-        cv2.arrowedLine(
-            picture, foot.astype(int).tolist(), tip.astype(int).tolist(), colour, thickness, cv2.LINE_AA, 0, 0.25
-        )
-    text("N", (width - 40, 92))
+def _metres(length_m: float | None) -> str:
+    return "-" if length_m is None else f"{length_m:.1f} m"

@@ -1,0 +1,105 @@
+"""``sim``: a simulated flight without GNSS, with the real daemon and real MAVLink; no hardware, no other data."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tqdm import tqdm
+
+from ortholoc_edge.bench.metrics import Spread
+from ortholoc_edge.cli import matcher_options
+from ortholoc_edge.errors import ConfigError
+from ortholoc_edge.pipeline.localizer import LocalizerOptions
+from ortholoc_edge.tiles.pack import Pack
+
+if TYPE_CHECKING:
+    from ortholoc_sim.flight import FlightReport
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = subparsers.add_parser(
+        "sim",
+        help="fly a simulated minute without GNSS",
+        description="Flies a simulated vehicle over a generated world in real time. GNSS is cut off after takeoff; "
+        "the real daemon localizes rendered camera frames on the committed demo pack and sends MAVLink over a "
+        "loopback UDP socket to a simulated autopilot that steers by it. Exit code 1 if it failed to localize.",
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("out"), metavar="DIR", help="for track.png and summary.json (default: out)"
+    )
+    parser.add_argument("--seed", type=int, default=1, help="of sensor errors, wind and noise (default: %(default)s)")
+    parser.add_argument(
+        "--duration", type=float, default=65.0, metavar="S", help="of the flight, at least 30 (default: %(default)s)"
+    )
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    matcher_options.add(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    # Not at the top: every other command works without the simulation.
+    from ortholoc_sim import demo_pack_path
+    from ortholoc_sim.flight import FlightOptions, draw_track, run_flight
+
+    if args.duration < 30.0:
+        raise ConfigError("a flight of less than 30 s leaves too little after GNSS is lost")
+    # Build the model now, with its progress bar; the daemon then finds it.
+    matcher_options.matcher(args)
+    options = FlightOptions(
+        seed=args.seed,
+        duration_s=args.duration,
+        localizer=LocalizerOptions(adhop=not args.no_adhop),
+        matcher=matcher_options.settings(args),
+    )
+    done = threading.Event()
+    ticker = threading.Thread(target=_show_time, args=(args.duration, done), daemon=True)
+    ticker.start()
+    try:
+        report = run_flight(options)
+    finally:
+        done.set()
+        ticker.join()
+    args.out.mkdir(parents=True, exist_ok=True)
+    draw_track(report, Pack.open(demo_pack_path()), args.out / "track.png")
+    summary = report.summary()
+    (args.out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    print(json.dumps(summary) if args.json else _table(report, args))
+    return 0 if report.passed else 1
+
+
+def _show_time(duration_s: float, done: threading.Event) -> None:
+    """A bar of the seconds flown; making the world takes some before."""
+    with tqdm(total=round(duration_s), desc="flight", unit="s", file=sys.stderr, leave=False) as bar:
+        # The world is made first, which takes a few seconds that the bar does not know of.
+        while not done.wait(1.0):
+            bar.update(min(1, bar.total - bar.n))
+
+
+def _table(report: FlightReport, args: argparse.Namespace) -> str:
+    def spread(s: Spread, unit: str) -> str:
+        if s.median is None or s.p90 is None or s.max is None:
+            return "-"
+        return f"median {s.median:.2f}  p90 {s.p90:.2f}  max {s.max:.2f} {unit}"
+
+    end = report.final_dead_reckoning_error_m
+    rejected = ", ".join(f"{reason} {count}" for reason, count in report.rejections.items())
+    rows = [
+        ("flight", f"{report.duration_s:.0f} s, GNSS lost at {report.gnss_lost_s:.0f} s, matcher {args.matcher}"),
+        ("frames", f"{report.frames}; after GNSS was lost {report.fixes_after} of {report.frames_after} gave a fix"),
+        ("rejected", rejected or "none"),
+        ("fix error", spread(report.position_m, "m")),
+        ("fix rotation error", spread(report.attitude_deg, "deg")),
+        ("latency from exposure", spread(report.latency_ms, "ms")),
+        ("autopilot error", spread(report.autopilot_error_m, "m, horizontal, after GNSS was lost")),
+        ("dead reckoning alone", "-" if end is None else f"{end:.1f} m off at the end"),
+        ("autopilot's filter", ", ".join(f"{verdict} {count}" for verdict, count in report.vision.items() if count)),
+        ("pictures", f"{args.out / 'track.png'}, figures in {args.out / 'summary.json'}"),
+        ("result", "localized without GNSS" if report.passed else "FAILED: " + "; ".join(report.problems)),
+    ]
+    width = max(len(name) for name, _ in rows)
+    return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
