@@ -150,7 +150,7 @@ def test_a_file_of_ones_own_needs_its_hash(tmp_path: Path, xfeat_model: models.S
         models.load_file(path, "0" * 64)
     shutil.copy(xfeat_model.path.with_suffix(".json"), path.with_suffix(".json"))
     assert models.load_file(path, None).sha256 == xfeat_model.sha256
-    matcher = make_matcher("xfeat", working_px=320, threads=1, model_path=path)
+    matcher = make_matcher("xfeat", working_px=320, max_keypoints=2048, threads=1, model_path=path)
     assert matcher.model_sha256 == xfeat_model.sha256
 
 
@@ -176,15 +176,15 @@ def test_another_graph_is_refused() -> None:
 
 
 def test_names_and_numbers_of_matchers_are_checked(tmp_path: Path, filled: Path) -> None:
-    assert make_matcher("sift", working_px=512, threads=1).name == "sift"
+    assert make_matcher("sift", working_px=512, max_keypoints=2048, threads=1).name == "sift"
     with pytest.raises(ConfigError, match="known are: xfeat, sift"):
-        make_matcher("surf", working_px=512, threads=1)
+        make_matcher("surf", working_px=512, max_keypoints=2048, threads=1)
     with pytest.raises(ConfigError, match="multiple of 32"):
-        make_matcher("xfeat", working_px=500, threads=1)
+        make_matcher("xfeat", working_px=500, max_keypoints=2048, threads=1)
     with pytest.raises(ConfigError, match="uses no model"):
-        make_matcher("sift", working_px=512, threads=1, model_path=tmp_path / "x.onnx")
+        make_matcher("sift", working_px=512, max_keypoints=2048, threads=1, model_path=tmp_path / "x.onnx")
     with pytest.raises(ConfigError, match="without the model's file"):
-        make_matcher("xfeat", working_px=512, threads=1, model_sha256="0" * 64)
+        make_matcher("xfeat", working_px=512, max_keypoints=2048, threads=1, model_sha256="0" * 64)
 
 
 def _run(*words: str) -> int:
