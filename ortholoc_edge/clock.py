@@ -1,4 +1,5 @@
-"""The one place that reads time. Stamps are integer nanoseconds of a monotonic clock."""
+"""The one place that reads time for stamps, which are integer nanoseconds of a monotonic clock; `pipeline.trace`
+only measures durations."""
 
 from __future__ import annotations
 

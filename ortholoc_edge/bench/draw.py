@@ -162,4 +162,5 @@ def _furniture(canvas: ImageArray, grid: RasterGrid, convergence_rad: float, tra
 def _round_length(metres: float) -> float:
     """The largest 1, 2 or 5 times a power of ten that is not longer."""
     power = 10.0 ** math.floor(math.log10(max(metres, 1e-6)))
-    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= metres)
+    # Rounding can put the power just above the length.
+    return max((step * power for step in (1.0, 2.0, 5.0) if step * power <= metres), default=power)

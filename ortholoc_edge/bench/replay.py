@@ -6,7 +6,6 @@ from the truth with the errors it would have, drawn from a seeded generator.
 
 from __future__ import annotations
 
-import math
 import re
 import time
 from collections.abc import Callable, Iterable
@@ -177,17 +176,14 @@ def replay_flight(
 
     Args:
         localizer_for: a localizer for a frame's intrinsics.
-        ground_m: height of the surface at a map position (2,); may be NaN.
+        ground_m: typical height of the surface around a map position (2,).
     """
     autopilot = SimulatedAutopilot(kind, noise, seed)
     tracker = Tracker(georeference, sequence.nadir_body(), _tracker_options(noise))
     random = np.random.default_rng([seed, 1])
-    last_ground_m = math.nan
     for record in recorded:
         truth = record.map_from_camera
-        below = ground_m(truth.translation[:2])
-        last_ground_m = below if math.isfinite(below) else last_ground_m
-        height_m = truth.translation[2] - last_ground_m if math.isfinite(last_ground_m) else 0.0
+        height_m = float(truth.translation[2]) - ground_m(truth.translation[:2])
         xy = truth.translation[:2]
         state = autopilot.state(
             record.stamp_ns,

@@ -13,7 +13,7 @@ from affine import Affine
 
 from ortholoc_edge.bench import metrics, report, sequence
 from ortholoc_edge.bench.replay import FrameResult, PriorKind, PriorNoise, replay_flight, replay_sample
-from ortholoc_edge.errors import MapError
+from ortholoc_edge.errors import DatasetError, MapError
 from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.matching.types import Matcher
@@ -44,7 +44,7 @@ def run_flight(
             recorded,
             localizer_for,
             store.pack.georeference,
-            lambda xy: float(store.heights(xy[None])[0]),
+            lambda xy: _ground(store, xy),
             kind=kind,
             noise=noise,
             seed=seed,
@@ -67,8 +67,7 @@ def run_samples(
         sample = sequence.read_sample(path)
         with sample_store(sample) as store:
             localizer = Localizer(sample.camera, store, matcher, options)
-            below = store.heights(sample.map_from_camera.translation[None, :2])[0]
-            ground_m = float(below) if np.isfinite(below) else float(np.nanmedian(sample.dsm))
+            ground_m = _ground(store, sample.map_from_camera.translation[:2])
             try:
                 yield replay_sample(
                     sample,
@@ -81,6 +80,16 @@ def run_samples(
                 )
             finally:
                 localizer.close()
+
+
+def _ground(store: MapStore, xy_map: FloatArray) -> float:
+    ground_m = store.ground_near(xy_map)
+    if ground_m is None:
+        raise DatasetError(
+            f"{store.pack.path}: no surface model near the true position ({xy_map[0]:.0f}, {xy_map[1]:.0f}); is this "
+            "the pack of this sequence?"
+        )
+    return ground_m
 
 
 @contextmanager

@@ -23,6 +23,9 @@ def clustered(jacobian: FloatArray, residuals: FloatArray, weights: FloatArray, 
     size. One scalar rather than the sandwich itself, which with a few dozen clusters is noisy and may be
     rank-deficient.
 
+    The weights stand in for the curvature of the robust loss, which makes the variances some 20 % too small for
+    Gaussian errors; the caller's factor for absorbed errors, fitted on real flights, contains that.
+
     Args:
         jacobian: (N, 2, P) of the residuals by the parameters.
         residuals: (N, 2) px.

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ortholoc_edge.geometry.arrays import FloatArray
+from ortholoc_edge.geometry.arrays import Float32Array, FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,3 +96,30 @@ def resize_px(px: npt.ArrayLike, scale: npt.ArrayLike) -> FloatArray:
     ``(k + 0.5) * s - 0.5``, as OpenCV's and GDAL's resampling have it: the outer corners stay.
     """
     return (np.asarray(px, dtype=np.float64) + 0.5) * np.asarray(scale, dtype=np.float64) - 0.5
+
+
+def bilinear(raster: Float32Array, px: npt.ArrayLike) -> FloatArray:
+    """Values (N,) of a raster (h, w) at pixels (N, 2), centres at integers.
+
+    NaN off the raster, and wherever a cell that takes part is NaN: beside a hole a height would be half
+    invented. The outermost half pixel is off: it has a neighbour on one side only.
+    """
+    height, width = raster.shape
+    u, v = np.asarray(px, dtype=np.float64).T
+    with np.errstate(invalid="ignore"):
+        inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
+    u, v = np.where(inside, u, 0.0), np.where(inside, v, 0.0)
+    column = np.minimum(u.astype(np.intp), max(width - 2, 0))
+    row = np.minimum(v.astype(np.intp), max(height - 2, 0))
+    right, below = np.minimum(column + 1, width - 1), np.minimum(row + 1, height - 1)
+    a, b = u - column, v - row
+    values = np.zeros(len(u))
+    for weight, rows, columns in (
+        ((1 - a) * (1 - b), row, column),
+        (a * (1 - b), row, right),
+        ((1 - a) * b, below, column),
+        (a * b, below, right),
+    ):
+        # A cell of no weight takes no part, so that a NaN there does no harm.
+        values += np.where(weight > 0, weight * raster[rows, columns], 0.0)
+    return np.where(inside, values, np.nan)

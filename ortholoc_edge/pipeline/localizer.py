@@ -49,8 +49,6 @@ _CONVINCING_RATIO = 0.35
 # A map picture finer than the frame is no use; a coarser one than this is hard to match (field-notes, scale).
 _MAX_COARSENING = 3.0
 _UNSTATED_SIGMA_PX = 0.5
-# Half sides of the squares around the predicted position in which the ground's height is looked up.
-_GROUND_REACH_M = (20.0, 80.0, 320.0)
 
 
 class LocalizerOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -193,13 +191,12 @@ class Localizer:
     def _hypotheses(self, prior: PosePrior, outline: FloatArray) -> list[PosePrior]:
         footprint_m = float(np.ptp(outline, axis=0).min())
         found = hypotheses(prior, footprint_m)
-        if len(found) > MAX_HYPOTHESES:
+        if found is None:
             raise _RejectedError(
                 Reason.PRIOR_TOO_WIDE,
-                f"heading within {math.degrees(prior.heading_sigma_rad):.0f} deg and position within "
-                f"{prior.position_sigma_m:.0f} m (1 sigma), of views {footprint_m:.0f} m wide: too many to try",
-                len(found),
-                MAX_HYPOTHESES,
+                f"heading within {math.degrees(prior.heading_sigma_rad):.0f} deg (1 sigma), views {footprint_m:.0f} m "
+                f"wide: more than {MAX_HYPOTHESES} to try; horizontal 1-sigma, m",
+                prior.position_sigma_m,
             )
         return found
 
@@ -207,7 +204,7 @@ class Localizer:
         with trace.stage("map_window"):
             ground_m, outline = ground or self._predicted_ground(prior)
             gsd_m = self._distance_to_ground(prior, ground_m) / self._working.focal_px
-            window = self._read(search_bounds(outline, prior, self._options.search_sigmas), gsd_m)
+            window = self._read(search_bounds(outline, prior, ground_m, self._options.search_sigmas), gsd_m)
             dop_grey = precondition.grey_map(window)
         with trace.stage("view"):
             local = self._local_frame(window, ground_m)
@@ -235,19 +232,11 @@ class Localizer:
     def _predicted_ground(self, prior: PosePrior) -> tuple[float, FloatArray]:
         """Typical height of the surface in the predicted view, and the view's footprint (K, 2) on it."""
         pose = prior.map_from_camera
-        ground_m = math.nan
-        for reach_m in _GROUND_REACH_M:
-            offsets = np.linspace(-reach_m, reach_m, 7)
-            around = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2) + pose.translation[:2]
-            heights = self._store.heights(around)
-            if np.isfinite(heights).any():
-                ground_m = float(np.nanmedian(heights))
-                break
-        if math.isnan(ground_m):
+        ground_m = self._store.ground_near(pose.translation[:2])
+        if ground_m is None:
             raise _RejectedError(
                 Reason.OUTSIDE_MAP,
-                f"no surface model within {_GROUND_REACH_M[-1]:.0f} m of the predicted position "
-                f"({pose.translation[0]:.0f}, {pose.translation[1]:.0f})",
+                f"no surface model near the predicted position ({pose.translation[0]:.0f}, {pose.translation[1]:.0f})",
             )
         outline = np.empty((0, 2))
         for _ in range(2):
@@ -384,7 +373,9 @@ class Localizer:
             on_frame &= matches.confidence >= MIN_CONFIDENCE
         matches = matches.take(np.flatnonzero(on_frame))
         matches = Matches(self.camera.undistorted_px(matches.query_px), view.dop_px(matches.map_px), matches.confidence)
-        matches = matches.take(np.flatnonzero(np.isfinite(matches.map_px).all(axis=1)))
+        # A pixel off the horizon, or in a corner where the lens model ends, has no counterpart.
+        paired = np.isfinite(matches.map_px).all(axis=1) & np.isfinite(matches.query_px).all(axis=1)
+        matches = matches.take(np.flatnonzero(paired))
         matches = self._near_prediction(matches, scene.views[0])
         lifted = lift(matches.map_px, scene.window)
         estimate = None

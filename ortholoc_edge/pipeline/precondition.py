@@ -16,9 +16,9 @@ import numpy as np
 from ortholoc_edge.geometry import homography
 from ortholoc_edge.geometry.arrays import BoolArray, FloatArray, ImageArray
 from ortholoc_edge.geometry.camera import Camera
+from ortholoc_edge.geometry.grid import bilinear
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.prior import MAX_RANGE_HEIGHTS, PosePrior
-from ortholoc_edge.pose.lift import bilinear
 from ortholoc_edge.tiles.georeference import LocalFrame
 from ortholoc_edge.tiles.window import MapWindow
 

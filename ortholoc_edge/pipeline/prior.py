@@ -18,6 +18,7 @@ Bounds = tuple[float, float, float, float]
 # (field-notes "Oblique views": mask what is beyond ten times the ground sampling distance at nadir).
 MAX_RANGE_HEIGHTS = 8.0
 _SAMPLES_PER_SIDE = 5
+_CLEAR_RANGE_HEIGHTS = 3.0
 # XFeat bears about 30 degrees of turn (matchers.md, "Rotation").
 _HEADING_STEP_RAD = np.pi / 6
 _WHOLE_CIRCLE = 12
@@ -26,6 +27,7 @@ _SHIFT_OF_FOOTPRINT = 0.6
 _STEP_OF_FOOTPRINT = 0.6
 # Each costs a network pass; more is area search, not tracking.
 MAX_HYPOTHESES = 40
+_MAX_LISTED = 100_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,20 +95,33 @@ def footprint(camera: Camera, map_from_camera: Rigid3, ground_m: float) -> Float
     return np.asarray(map_from_camera.translation[:2] + rays[:, :2] * reach[:, None], dtype=np.float64)
 
 
-def search_bounds(points_map: FloatArray, prior: PosePrior, sigmas: float) -> Bounds:
-    """Bounds of a footprint (K, 2), inflated by ``sigmas`` of the prior: its position, and its angles at the
-    distance of the footprint's far end."""
+def search_bounds(points_map: FloatArray, prior: PosePrior, ground_m: float, sigmas: float) -> Bounds:
+    """Bounds of a footprint (K, 2) on a level ground, inflated by ``sigmas`` of what the prior may be off.
+
+    A tilt error moves the far end, a distance r away from a height h, by ``(h^2 + r^2) / h``, a heading error by
+    r and a height error by ``r / h``. Beyond three heights the ground is seen so flat that a part of it may miss.
+    """
+    height = float(prior.map_from_camera.translation[2]) - ground_m
     away = float(np.linalg.norm(points_map - prior.map_from_camera.translation[:2], axis=1).max())
-    # Over flat ground at height h a tilt error e moves the axis by h (1 + tan^2) e; the reach bounds it.
-    height_reach = away * (prior.tilt_sigma_rad + min(prior.heading_sigma_rad, np.pi))
-    margin = sigmas * float(np.hypot(prior.position_sigma_m, height_reach))
+    clear = min(away, _CLEAR_RANGE_HEIGHTS * height)
+    margin = sigmas * float(
+        np.linalg.norm(
+            [
+                prior.position_sigma_m,
+                prior.tilt_sigma_rad * (height**2 + clear**2) / height,
+                min(prior.heading_sigma_rad, np.pi) * away,
+                prior.height_sigma_m * clear / height,
+            ]
+        )
+    )
     west, south = points_map.min(axis=0) - margin
     east, north = points_map.max(axis=0) + margin
     return float(west), float(south), float(east), float(north)
 
 
-def hypotheses(prior: PosePrior, footprint_m: float) -> list[PosePrior]:
-    """Narrower priors that together cover a wide one, the likeliest first.
+def hypotheses(prior: PosePrior, footprint_m: float) -> list[PosePrior] | None:
+    """Narrower priors that together cover a wide one, the likeliest first; None if there are more than
+    `MAX_HYPOTHESES`.
 
     A matcher bears a shift of about half the picture and a turn of about 30 degrees; a prior within that is its
     own single hypothesis.
@@ -116,6 +131,8 @@ def hypotheses(prior: PosePrior, footprint_m: float) -> list[PosePrior]:
     """
     headings = _heading_steps(prior.heading_sigma_rad)
     offsets = _position_steps(prior, footprint_m)
+    if offsets is None or len(offsets) * len(headings) > MAX_HYPOTHESES:
+        return None
     if len(headings) == 1 and len(offsets) == 1:
         return [prior]
     covariance = prior.covariance.copy()
@@ -150,22 +167,19 @@ def _heading_steps(sigma_rad: float) -> list[float]:
     return sorted((_HEADING_STEP_RAD * k for k in range(-count, count + 1)), key=abs)
 
 
-def _position_steps(prior: PosePrior, footprint_m: float) -> list[FloatArray]:
-    """Horizontal offsets (2,) on a grid over the prior's two-sigma ellipse, nearest in sigmas first."""
+def _position_steps(prior: PosePrior, footprint_m: float) -> FloatArray | None:
+    """Horizontal offsets (N, 2) on a grid over the prior's two-sigma ellipse; None if they are too many to list."""
     if 2.0 * prior.position_sigma_m <= _SHIFT_OF_FOOTPRINT * footprint_m:
-        return [np.zeros(2)]
+        return np.zeros((1, 2))
     step = _STEP_OF_FOOTPRINT * footprint_m
-    reach = int(np.ceil(2.0 * prior.position_sigma_m / step))
-    if (2 * reach + 1) ** 2 > MAX_HYPOTHESES * 4:
-        return [np.zeros(2)] * (MAX_HYPOTHESES + 1)
-    inverse = np.linalg.inv(prior.covariance[:2, :2])
-    found = []
-    for east in range(-reach, reach + 1):
-        for north in range(-reach, reach + 1):
-            offset = np.array([east * step, north * step])
-            # A cell counts if it comes within two sigmas.
-            near = offset * max(0.0, 1.0 - 0.5 * step / max(float(np.linalg.norm(offset)), 1e-9))
-            squared = float(near @ inverse @ near)
-            if squared <= 4.0:
-                found.append((squared, east, north, offset))
-    return [entry[3] for entry in sorted(found, key=lambda entry: entry[:3])]
+    # The ellipse's own box: a long and narrow one needs few cells.
+    reach = np.ceil(2.0 * np.sqrt(np.diag(prior.covariance)[:2]) / step)
+    if np.prod(2 * reach + 1) > _MAX_LISTED:
+        return None
+    east, north = (step * np.arange(-r, r + 1) for r in reach)
+    grid = np.stack(np.meshgrid(east, north, indexing="ij"), axis=-1).reshape(-1, 2)
+    # A cell counts if it comes within two sigmas.
+    length = np.linalg.norm(grid, axis=1, keepdims=True)
+    near = grid * np.maximum(0.0, 1.0 - 0.5 * step / np.maximum(length, 1e-9))
+    squared = np.einsum("ni,ij,nj->n", near, np.linalg.inv(prior.covariance[:2, :2]), near)
+    return np.asarray(grid[squared <= 4.0], dtype=np.float64)

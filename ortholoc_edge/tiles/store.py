@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from ortholoc_edge.errors import MapError
 from ortholoc_edge.geometry.arrays import FloatArray
-from ortholoc_edge.geometry.grid import RasterGrid
+from ortholoc_edge.geometry.grid import RasterGrid, bilinear
 from ortholoc_edge.tiles.cog import BLOCK_PX, Cog, PixelWindow, describe, set_block_cache
 from ortholoc_edge.tiles.manifest import RasterFile
 from ortholoc_edge.tiles.pack import Pack
@@ -36,6 +36,8 @@ _LEVEL_SLACK = 1.01
 
 # Of a pixel: bounds that were computed to lie on a pixel's edge should not drag in its neighbour.
 _EDGE_SLACK_PX = 1e-6
+
+_GROUND_REACH_M = (20.0, 80.0, 320.0)
 
 
 class MapStore:
@@ -144,6 +146,17 @@ class MapStore:
             array.flags.writeable = False
         return MapWindow(dop, valid, dop_grid, dsm, self._dsm.grids[dsm_level].crop(*dsm_window))
 
+    def ground_near(self, xy_map: npt.ArrayLike) -> float | None:
+        """Typical height of the surface around a map position (2,), m: the median over 20 m to each side, over
+        80 or 320 m where there is no data nearer; None where there is none at all."""
+        for reach_m in _GROUND_REACH_M:
+            offsets = np.linspace(-reach_m, reach_m, 7)
+            around = np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2)
+            heights = self.heights(around + np.asarray(xy_map, dtype=np.float64))
+            if np.isfinite(heights).any():
+                return float(np.nanmedian(heights))
+        return None
+
     def heights(self, xy_map: npt.ArrayLike) -> FloatArray:
         """Heights (N,) at map positions (N, 2), bilinear on the full resolution.
 
@@ -164,7 +177,7 @@ class MapStore:
             width, height = np.minimum(base[own].max(axis=0) + 2, (grid.width, grid.height)) - (column, row)
             window = PixelWindow(int(column), int(row), int(width), int(height))
             raster = self._dsm.read_heights(0, window)
-            heights[rows[own]] = _bilinear(raster, px[rows[own]] - (column, row))
+            heights[rows[own]] = bilinear(raster, px[rows[own]] - (column, row))
         return heights
 
 
@@ -208,17 +221,3 @@ def _pixels(grid: RasterGrid, bounds: Bounds, margin: int) -> PixelWindow | None
         spans.append((start, max(stop, start + 1)))
     (column, column_end), (row, row_end) = spans
     return PixelWindow(column, row, column_end - column, row_end - row)
-
-
-def _bilinear(raster: npt.NDArray[np.float32], px: FloatArray) -> FloatArray:
-    base = np.minimum(np.floor(px).astype(np.intp), np.array(raster.shape)[::-1] - 1)
-    fraction = px - base
-    # The neighbour of a position on the last row or column has no weight; its index only has to exist.
-    far = np.minimum(base + 1, np.array(raster.shape)[::-1] - 1)
-    total = np.zeros(len(px))
-    for columns, weight_u in ((base[:, 0], 1.0 - fraction[:, 0]), (far[:, 0], fraction[:, 0])):
-        for rows, weight_v in ((base[:, 1], 1.0 - fraction[:, 1]), (far[:, 1], fraction[:, 1])):
-            weight = weight_u * weight_v
-            # A cell of no weight may be nodata: zero times NaN must not count.
-            total += np.where(weight > 0, weight * raster[rows, columns], 0.0)
-    return total

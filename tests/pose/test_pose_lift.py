@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import finite
 
-from ortholoc_edge.geometry.grid import RasterGrid
-from ortholoc_edge.pose.lift import bilinear, lift
+from ortholoc_edge.geometry.grid import RasterGrid, bilinear
+from ortholoc_edge.pose.lift import lift
 from ortholoc_edge.tiles.window import MapWindow
 
 
