@@ -1,0 +1,71 @@
+"""What the README and the example configuration promise must be what is there."""
+
+import re
+from pathlib import Path
+
+import msgspec
+
+from ortholoc_edge import config
+from ortholoc_edge.cli import _parser
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def blocks(heading: str) -> list[str]:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    section = text.split(f"## {heading}\n")[1].split("\n## ")[0]
+    return re.findall(r"```sh\n(.*?)\n```", section, re.DOTALL)
+
+
+def test_ci_runs_the_readmes_test_command():
+    [command] = blocks("Test it")
+    assert "\n" not in command
+    assert f"\n{command}\n" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+
+
+def test_readmes_main_command_is_one_line_that_runs_the_simulation():
+    [command] = blocks("Fly it (no hardware, no data)")
+    assert "\n" not in command
+    assert command.endswith("ortholoc-edge sim")
+    assert "-c constraints.txt" in command
+
+
+def test_every_command_that_the_readme_names_exists():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    parser = _parser()
+    [actions] = [a for a in parser._actions if hasattr(a, "choices") and a.choices]
+    named = set(re.findall(r"`ortholoc-edge (\w+)", text))
+    assert named <= set(actions.choices)
+    assert set(actions.choices) <= named | {"sim"}
+
+
+def test_links_of_the_documents_lead_somewhere():
+    for document in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
+        for target in re.findall(r"\]\(([^)#:]+)\)", document.read_text(encoding="utf-8")):
+            assert (document.parent / target).exists(), f"{document.name} links to {target}"
+
+
+def test_modules_that_the_architecture_names_exist():
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    for name in re.findall(r"`((?:adapters|bench|pipeline|matching|pose|tiles|geometry)/\w+\.py)`", text):
+        assert (ROOT / "ortholoc_edge" / name).is_file(), name
+
+
+def test_example_configuration_has_every_key_with_its_default():
+    """Unknown keys fail to parse; keys that were forgotten or whose default has moved fail here."""
+    example = ROOT / "config" / "example.toml"
+    parsed = config.read_config(example)
+    text = example.read_text(encoding="utf-8")
+    example_only = {"camera.latency_ms", "camera.source", "link.endpoint", "log.folder", "map.pack"}
+
+    def check(value: msgspec.Struct, prefix: str) -> None:
+        for field in msgspec.structs.fields(value):
+            key, have = f"{prefix}{field.encode_name}", getattr(value, field.name)
+            if isinstance(have, msgspec.Struct):
+                check(have, f"{key}.")
+                continue
+            assert re.search(rf"^(# )?{field.encode_name} = ", text, re.MULTILINE), f"{key} is not in the example"
+            if prefix != "intrinsics." and key not in example_only and not field.required:
+                assert have == field.default, f"{key}: the example says {have}, the default is {field.default}"
+
+    check(parsed, "")
