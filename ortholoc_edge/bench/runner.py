@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -61,11 +61,17 @@ def run_samples(
     kind: PriorKind,
     noise: PriorNoise,
     seed: int,
+    pack: MapStore | None = None,
 ) -> Iterator[FrameResult]:
-    """Localize OrthoLoC samples, each on its own rasters. Raises: DatasetError for one that can't be read."""
+    """Localize OrthoLoC samples.
+
+    Args:
+        pack: a map in the samples' own local frame, of another year or sensor, say; None: each sample's rasters.
+    Raises: DatasetError for a sample that can't be read or whose place is not on the pack.
+    """
     for index, path in enumerate(paths):
         sample = sequence.read_sample(path)
-        with sample_store(sample) as store:
+        with sample_store(sample) if pack is None else nullcontext(pack) as store:
             localizer = Localizer(sample.camera, store, matcher, options)
             ground_m = _ground(store, sample.map_from_camera.translation[:2])
             try:
@@ -87,7 +93,7 @@ def _ground(store: MapStore, xy_map: FloatArray) -> float:
     if ground_m is None:
         raise DatasetError(
             f"{store.pack.path}: no surface model near the true position ({xy_map[0]:.0f}, {xy_map[1]:.0f}); is this "
-            "the pack of this sequence?"
+            "the pack of this sequence, in its frame?"
         )
     return ground_m
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,7 +36,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "SEQUENCE is a folder of photos with a *_flight.csv, an OrthoLoC sample (.npz) or a folder of samples.",
     )
     parser.add_argument("sequence", type=Path, metavar="SEQUENCE")
-    parser.add_argument("--pack", type=Path, help="area pack; a sample brings its own map and needs none")
+    parser.add_argument(
+        "--pack",
+        type=Path,
+        help="area pack; a sample brings its own map, and with --pack uses another in the same local frame",
+    )
     parser.add_argument(
         "--prior",
         choices=[str(k) for k in PriorKind],
@@ -88,8 +93,6 @@ def run(args: argparse.Namespace) -> int:
     samples = sequence.sample_paths(args.sequence)
     if not args.sequence.exists():
         raise DatasetError(f"{args.sequence}: no such file or folder")
-    if samples and args.pack is not None:
-        raise ConfigError("an OrthoLoC sample brings its own map in its own local frame; leave --pack away")
     if not samples and args.pack is None:
         raise ConfigError("--pack is missing; build one with: ortholoc-edge tiles build --dop … --dsm … --out PACK")
     matcher = matcher_options.matcher(args)
@@ -104,17 +107,16 @@ def run(args: argparse.Namespace) -> int:
             results.append(replace(result, image=None))
 
     try:
-        if samples:
-            collect(run_samples(samples, matcher, options, kind, noise, args.seed), len(samples))
-            pack_name = "the samples' own rasters"
-        else:
-            recorded = sequence.read_flight(args.sequence)
-            with MapStore(Pack.open(args.pack)) as store:
+        with MapStore(Pack.open(args.pack)) if args.pack is not None else nullcontext() as store:
+            if samples:
+                collect(run_samples(samples, matcher, options, kind, noise, args.seed, store), len(samples))
+            elif store is not None:
+                recorded = sequence.read_flight(args.sequence)
                 collect(run_flight(recorded, store, matcher, options, kind, noise, args.seed), len(recorded))
-                if args.out:
-                    caption = f"{args.sequence.name}: {matcher.name}, prior {kind}"
-                    write_png(args.out / "track.png", report.track_picture(store, results, caption))
-            pack_name = str(args.pack)
+            if args.out and store is not None:
+                caption = f"{args.sequence.name}: {matcher.name}, prior {kind}"
+                write_png(args.out / "track.png", report.track_picture(store, results, caption))
+        pack_name = "the samples' own rasters" if args.pack is None else str(args.pack)
     finally:
         if writer is not None:
             writer.close()
