@@ -45,6 +45,7 @@ from ortholoc_edge.pipeline.navigator import Navigator
 from ortholoc_edge.pipeline.odometry import VelocityOdometry
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.tracker import Tracker, TrackerStatus
+from ortholoc_edge.pose import pnp
 from ortholoc_edge.tiles.georeference import Georeference
 from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.store import MapStore
@@ -167,7 +168,7 @@ class Daemon:
         self._link.start()
         capture.start()
         systemd.notify("READY=1")
-        logger.info("running: pack %s, matcher %s", self._config.map.pack, self._matcher.name)
+        logger.info("running: pack %s, matcher %s, solver %s", self._config.map.pack, self._matcher.name, pnp.SOLVER)
         try:
             self._work(stop)
         finally:
@@ -359,7 +360,10 @@ def vision_estimate(
 
 def _require_flyable(georeference: Georeference, pack: str) -> None:
     if georeference.crs is None:
-        raise MapError(f"{pack}: has no reference system, so its positions mean nothing to an autopilot")
+        raise MapError(
+            f"{pack}: has no reference system, so its positions mean nothing to an autopilot; rebuild it from rasters "
+            "in a projected system"
+        )
     try:
         georeference.vertical.amsl_from_map(0.0)
     except MapError as err:

@@ -78,6 +78,7 @@ class Summary(Struct, frozen=True, kw_only=True):
     cpu_ms_per_frame: float
     rss_mb: float
     matcher: str
+    solver: str
     model_sha256: str | None
     pack: str
     prior: str

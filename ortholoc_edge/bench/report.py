@@ -105,7 +105,8 @@ def table(summary: Summary) -> str:
         ("sequence", f"{summary.sequence} on {summary.pack}"),
         (
             "matcher",
-            f"{summary.matcher}, AdHoP {'on' if summary.adhop else 'off'}, prior {summary.prior}, seed {summary.seed}",
+            f"{summary.matcher}, AdHoP {'on' if summary.adhop else 'off'}, prior {summary.prior}, "
+            f"solver {summary.solver}, seed {summary.seed}",
         ),
         ("model", summary.model_sha256 or "none (no weights)"),
         (

@@ -18,6 +18,7 @@ from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.matching.types import Matcher
 from ortholoc_edge.pipeline.localizer import Localizer, LocalizerOptions
+from ortholoc_edge.pose import pnp
 from ortholoc_edge.tiles.build import PackOptions, build_pack
 from ortholoc_edge.tiles.store import MapStore
 
@@ -156,6 +157,7 @@ def summarise(
         cpu_ms_per_frame=float(np.median([r.cpu_ms for r in results])) if results else 0.0,
         rss_mb=report.rss_mb(),
         matcher=matcher.name,
+        solver=pnp.SOLVER,
         model_sha256=matcher.model_sha256,
         pack=pack,
         prior=str(prior),

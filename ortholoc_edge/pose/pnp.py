@@ -1,4 +1,5 @@
-"""Robust pose from 2D-3D matches: PoseLib's LO-RANSAC, then a Huber refinement that knows its covariance.
+"""Robust pose from 2D-3D matches: PoseLib's LO-RANSAC, then a Huber refinement that knows its covariance. Where
+PoseLib has no wheel (64-bit Arm) OpenCV's USAC stands in.
 
 Paper, section "Initial Camera Calibration / Localization" and appendix "Optimization of Camera Parameters".
 Points are in a local metric frame (`tiles.georeference.LocalFrame`), so that float64 loses nothing and lengths
@@ -9,14 +10,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-import poselib
 
 from ortholoc_edge.geometry import covariance as cov
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import BoolArray, FloatArray
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.rigid import Rigid3
+
+try:
+    import poselib
+except ImportError:
+    poselib = None
+
+# Which robust solver runs; it is reported with every result, since it changes accuracy.
+SOLVER = "opencv-usac" if poselib is None else "poselib"
 
 # The paper's inlier threshold belongs to its images of about 1024 px; other sizes scale it.
 THRESHOLD_PX = 5.0
@@ -27,6 +36,8 @@ _MAX_ITERATIONS = 10_000
 _SUCCESS_PROBABILITY = 0.9999
 _LM_ITERATIONS = 30
 _MINIMUM_POINTS = 6
+# Of the inliers in the image, in inlier thresholds.
+_MINIMUM_EXTENT = 4.0
 # Matches closer than a fifth of the long side share the errors of a patch of the map and of the camera's model.
 _CLUSTERS_ACROSS = 5
 # Errors that vary slowly over the image are partly absorbed by the pose and so never show in the residuals.
@@ -112,6 +123,9 @@ def refine(
     inliers = errors <= max_error_px
     if np.count_nonzero(inliers) < _MINIMUM_POINTS:
         return None
+    if np.ptp(query_px[inliers], axis=0).max() < _MINIMUM_EXTENT * max_error_px:
+        # Seen from far enough away any points fall on one spot.
+        return None
     residuals, jacobian = _linearised(points_local[inliers], query_px[inliers], solved, pose, free_focal)
     side = max(camera.width, camera.height) / _CLUSTERS_ACROSS
     column, row = np.floor(query_px[inliers] / side).astype(np.intp).T
@@ -143,9 +157,20 @@ def refine(
 
 def _ransac(points: FloatArray, px: FloatArray, camera: Camera, max_error_px: float, seed: int) -> Rigid3 | None:
     origin = points.mean(axis=0)
+    find = _ransac_opencv if poselib is None else _ransac_poselib
+    camera_from_centred = find(points - origin, px, camera, max_error_px, seed)
+    if camera_from_centred is None or not np.isfinite(camera_from_centred).all():
+        return None
+    turn = camera_from_centred[:, :3]
+    return Rigid3(turn.T, origin - turn.T @ camera_from_centred[:, 3])
+
+
+def _ransac_poselib(
+    points: FloatArray, px: FloatArray, camera: Camera, max_error_px: float, seed: int
+) -> FloatArray | None:
     pose, info = poselib.estimate_absolute_pose(
         px,
-        points - origin,
+        points,
         {
             "model": "PINHOLE",
             "width": camera.width,
@@ -160,11 +185,26 @@ def _ransac(points: FloatArray, px: FloatArray, camera: Camera, max_error_px: fl
             "seed": seed,
         },
     )
-    camera_from_centred = np.asarray(pose.Rt, dtype=np.float64)
-    if info["num_inliers"] < _MINIMUM_POINTS or not np.isfinite(camera_from_centred).all():
+    return np.asarray(pose.Rt, dtype=np.float64) if info["num_inliers"] >= _MINIMUM_POINTS else None
+
+
+def _ransac_opencv(
+    points: FloatArray, px: FloatArray, camera: Camera, max_error_px: float, seed: int
+) -> FloatArray | None:
+    """OpenCV's USAC with MAGSAC scoring: for machines that PoseLib has no wheel for (64-bit Arm)."""
+    options = cv2.UsacParams()
+    options.score = cv2.SCORE_METHOD_MAGSAC
+    options.threshold = max_error_px
+    options.confidence = _SUCCESS_PROBABILITY
+    options.maxIterations = _MAX_ITERATIONS
+    options.randomGeneratorState = seed
+    try:
+        found, _, turn, shift, inliers = cv2.solvePnPRansac(points, px, camera.matrix, None, params=options)
+    except cv2.error:  # how OpenCV says that points are collinear or coincide
         return None
-    turn = camera_from_centred[:, :3]
-    return Rigid3(turn.T, origin - turn.T @ camera_from_centred[:, 3])
+    if not found or inliers is None or len(inliers) < _MINIMUM_POINTS:
+        return None
+    return np.column_stack([cv2.Rodrigues(turn)[0], shift]).astype(np.float64)
 
 
 def _zoomed(camera: Camera, focal_scale: float) -> Camera:
