@@ -172,7 +172,8 @@ class Localizer:
 
     def _checked_grey(self, frame: Frame) -> ImageArray:
         shape, camera = frame.image.shape, self.camera
-        if frame.image.dtype != np.uint8 or shape[:2] != (camera.height, camera.width):
+        size = camera.height, camera.width
+        if frame.image.dtype != np.uint8 or shape not in (size, (*size, 3)):
             raise _RejectedError(
                 Reason.BAD_FRAME,
                 f"{frame.name}: {shape} {frame.image.dtype}, but the camera's intrinsics are for "
