@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import queue
 import threading
@@ -19,6 +20,7 @@ FILE_NAME = "outcomes.jsonl"
 _QUEUE_LENGTH = 256
 # Half the limit each, so that what was just rotated away is still there.
 _KEPT_FILES = 2
+_CLOSE_WAIT_S = 5.0
 
 
 class Recorder:
@@ -53,14 +55,27 @@ class Recorder:
             self.dropped += 1
 
     def close(self) -> None:
-        """Write what waits and end the thread."""
-        self._queue.put(None)
-        self._thread.join(timeout=5.0)
-        self._file.close()
+        """Write what waits and end the thread; a disk that is full or hangs ends neither in an error nor in a wait
+        without end."""
+        with contextlib.suppress(queue.Full):
+            self._queue.put(None, timeout=_CLOSE_WAIT_S)
+        self._thread.join(timeout=_CLOSE_WAIT_S)
+        if self._thread.is_alive():
+            # It holds the file's lock; closing would wait for it.
+            logger.warning("%s: the disk hangs; the last outcomes are not written", self._path)
+            return
+        try:
+            # What a full disk did not take is still in the file's buffer.
+            self._file.close()
+        except OSError as err:
+            logger.warning("%s: can't write the last outcomes (%s)", self._path, err)
 
     def _run(self) -> None:
         while (record := self._queue.get()) is not None:
             try:
+                if self._file.closed:
+                    # A rotation failed half-way.
+                    self._file = self._path.open("ab")
                 self._file.write(msgspec.json.encode(record) + b"\n")
                 self._file.flush()
                 if self._file.tell() >= self._limit_bytes:
