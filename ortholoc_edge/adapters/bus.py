@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import logging
+from typing import Annotated
 
 import msgspec
 import zenoh
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from ortholoc_edge.errors import ConfigError
 from ortholoc_edge.pipeline.outcome import Fix, Outcome
@@ -26,7 +27,8 @@ class BusOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """
 
     enabled: bool = False
-    vehicle: str = "vehicle"
+    # No wildcards: zenoh would publish to every vehicle's key.
+    vehicle: Annotated[str, Meta(pattern="^[A-Za-z0-9_.-]+$")] = "vehicle"
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
 
 
@@ -38,11 +40,11 @@ class Bus:
 
     def __init__(self, options: BusOptions) -> None:
         config = zenoh.Config()
-        config.insert_json5("mode", '"peer"')
-        config.insert_json5("scouting/multicast/enabled", "false")
-        config.insert_json5("listen/endpoints", json.dumps(list(options.listen)))
         prefix = f"ortholoc/{options.vehicle}"
         try:
+            config.insert_json5("mode", '"peer"')
+            config.insert_json5("scouting/multicast/enabled", "false")
+            config.insert_json5("listen/endpoints", json.dumps(list(options.listen)))
             self._session = zenoh.open(config)
             self._token = self._session.liveliness().declare_token(f"{prefix}/alive")
             self._publishers = {
