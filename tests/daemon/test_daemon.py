@@ -1,0 +1,424 @@
+"""The real daemon between a folder or a video of rendered pictures and an autopilot on a real UDP socket or pty.
+
+The vehicle hovers where the pictures were taken, so that every frame has the same true pose.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+from adapters.fake_autopilot import FakeAutopilot, PtyWire, UdpWire, Wire, dialect
+from ortholoc_sim.site import Site
+from replay import rendered
+
+from ortholoc_edge.adapters import systemd
+from ortholoc_edge.adapters.camera import CameraOptions
+from ortholoc_edge.adapters.mavlink import LinkOptions
+from ortholoc_edge.config import Config, Intrinsics, LogOptions, MapOptions, MatcherOptions
+from ortholoc_edge.daemon import Daemon, LatestSlot
+from ortholoc_edge.errors import OrtholocError
+from ortholoc_edge.geometry import rotation
+from ortholoc_edge.pipeline.frame import Frame
+from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
+
+ROLL, PITCH, YAW = 3.0, -4.0, 30.0
+TRUTH = rendered.pose(roll_deg=ROLL, pitch_deg=PITCH, yaw_deg=YAW)
+# The EKF origin, 65 m from the vehicle: errors of axes and signs would be plain.
+SITE = Site(rendered.georeference(), TRUTH.translation - np.array([40.0, -50.0, 88.0]))
+TRUE_NED = SITE.autopilot_from_ned(SITE.ned_from_map(TRUTH.translation))
+PLACE = SITE.geopoint(SITE.ned_from_map(TRUTH.translation))
+
+
+def wait_for(condition: Callable[[], Any], what: str, seconds: float = 20.0) -> Any:
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        value = condition()
+        if value:
+            return value
+        time.sleep(0.01)
+    raise AssertionError(f"{what}: did not happen in {seconds:g} s")
+
+
+class HoveringAutopilot(FakeAutopilot):
+    """Stands still at the pose of the pictures; its GNSS is good to 1.5 m."""
+
+    def __init__(self, wire: Wire, with_origin: bool = True) -> None:
+        super().__init__(wire)
+        origin = SITE.origin
+        self.yaw_rate = 0.0
+        self.origin = None
+        if with_origin:
+            self.origin = (
+                round(origin.lat_deg * 1e7), round(origin.lon_deg * 1e7), round(origin.height_amsl_m * 1e3),
+            )  # fmt: skip
+
+    def truth_at(self, now_ns: int) -> np.ndarray:
+        return rendered.attitude(ROLL, PITCH, YAW)
+
+    def _stream(self, message_id: int, now_ns: int) -> Any:
+        ms = (now_ns - self.boot_ns) // 1_000_000
+        lat, lon = round(PLACE.lat_deg * 1e7), round(PLACE.lon_deg * 1e7)
+        alt_mm = round(PLACE.height_amsl_m * 1e3)
+        if message_id == dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
+            return dialect.MAVLink_local_position_ned_message(ms, *map(float, TRUE_NED), 0.0, 0.0, 0.0)
+        if message_id == dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT:
+            return dialect.MAVLink_global_position_int_message(ms, lat, lon, alt_mm, 88_000, 0, 0, 0, 0)
+        if message_id == dialect.MAVLINK_MSG_ID_GPS_RAW_INT:
+            return dialect.MAVLink_gps_raw_int_message(
+                0, 3, lat, lon, alt_mm, 80, 120, 0, 0, 14, h_acc=1500, v_acc=2500
+            )
+        return super()._stream(message_id, now_ns)
+
+    def messages(self, kind: str) -> list[Any]:
+        return [message for message in list(self.got) if message.get_type() == kind]
+
+
+def config(source: str, endpoint: str, **more: Any) -> Config:
+    camera = rendered.CAMERA
+    return Config(
+        camera=CameraOptions(source=source, rate_hz=4.0),
+        intrinsics=Intrinsics(
+            width_px=camera.width, height_px=camera.height, fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy
+        ),
+        map=MapOptions(pack=str(rendered.store().pack.path)),
+        link=LinkOptions(endpoint=endpoint, send=("odometry", "vision_position_estimate")),
+        matcher=MatcherOptions(name="sift", max_keypoints=2048),
+        **more,
+    )
+
+
+@contextlib.contextmanager
+def running(daemon: Daemon) -> Iterator[threading.Event]:
+    """The daemon in a thread; what it raised is raised here."""
+    stop, failures = threading.Event(), []
+
+    def work() -> None:
+        try:
+            daemon.run(stop)
+        except BaseException as error:
+            failures.append(error)
+
+    thread = threading.Thread(target=work, name="daemon-under-test")
+    thread.start()
+    try:
+        yield stop
+    finally:
+        stop.set()
+        thread.join(timeout=15.0)
+    assert not thread.is_alive()
+    if failures:
+        raise failures[0]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Sixty copies of one photo, every third cut short."""
+    path = tmp_path_factory.mktemp("frames")
+    photo = rendered.write_picture(path / "photo_00.jpg", rendered.picture(TRUTH))
+    data = photo.read_bytes()
+    for number in range(1, 60):
+        (path / f"photo_{number:02d}.jpg").write_bytes(data[: len(data) // 2] if number % 3 == 2 else data)
+    return path
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("video") / "flight.avi"
+    size = rendered.CAMERA.width, rendered.CAMERA.height
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 4.0, size)
+    assert writer.isOpened()
+    for _ in range(60):
+        writer.write(np.ascontiguousarray(rendered.picture(TRUTH)[..., ::-1]))
+    writer.release()
+    return path
+
+
+@pytest.fixture(params=["udp", "serial"])
+def peer(request: pytest.FixtureRequest) -> Iterator[tuple[HoveringAutopilot, str]]:
+    """The autopilot and the link's endpoint to it."""
+    wire: Any = UdpWire() if request.param == "udp" else PtyWire()
+    autopilot = HoveringAutopilot(wire)
+    endpoint = f"udpout:127.0.0.1:{wire.port}" if request.param == "udp" else f"serial:{wire.path}:921600"
+    yield autopilot, endpoint
+    autopilot.close()
+
+
+def check_estimates(autopilot: HoveringAutopilot, outcomes: list[tuple[Frame | None, Outcome]]) -> None:
+    captured = {outcome.stamp_ns // 1000 for _, outcome in outcomes if isinstance(outcome, Fix)}
+    odometry = autopilot.messages("ODOMETRY")
+    vision = autopilot.messages("VISION_POSITION_ESTIMATE")
+    for message in odometry:
+        # ArduPilot takes LOCAL_FRD, and by it means north and east (autopilot contract).
+        assert message.frame_id == dialect.MAV_FRAME_LOCAL_FRD
+        assert message.child_frame_id == dialect.MAV_FRAME_BODY_FRD
+        assert message.time_usec in captured
+        turn = rotation.from_quaternion(message.q)
+        assert math.degrees(rotation.angle_between(turn, rendered.attitude(ROLL, PITCH, YAW))) < 1.5
+        assert np.isfinite(message.pose_covariance).all()
+        assert message.pose_covariance[0] > 0
+    for message in vision:
+        assert message.usec in captured
+        assert np.degrees([message.roll, message.pitch, message.yaw]) == pytest.approx([ROLL, PITCH, YAW], abs=1.5)
+        assert np.isfinite(message.covariance).all()
+        assert message.covariance[0] > 0
+    for message in odometry + vision:
+        assert np.linalg.norm(np.array([message.x, message.y, message.z]) - TRUE_NED) < 3.0
+        assert message.get_srcComponent() == dialect.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
+        assert message.get_srcSystem() == autopilot.system_id
+
+
+def test_folder_to_autopilot(folder: Path, peer: tuple[HoveringAutopilot, str], tmp_path: Path) -> None:
+    """Photos cut short are told, and the daemon goes on."""
+    autopilot, endpoint = peer
+    outcomes: list[tuple[Frame | None, Outcome]] = []
+    daemon = Daemon(
+        config(f"folder:{folder}", endpoint, log=LogOptions(folder=str(tmp_path))),
+        on_outcome=lambda frame, outcome: outcomes.append((frame, outcome)),
+    )
+    with running(daemon):
+        wait_for(lambda: len(autopilot.messages("ODOMETRY")) >= 4, "four ODOMETRY")
+        wait_for(lambda: len(autopilot.messages("VISION_POSITION_ESTIMATE")) >= 4, "four VISION_POSITION_ESTIMATE")
+        wait_for(lambda: autopilot.messages("HEARTBEAT"), "a heartbeat")
+        wait_for(lambda: any(getattr(o, "reason", None) is Reason.BAD_FRAME for _, o in list(outcomes)), "a bad frame")
+    check_estimates(autopilot, outcomes)
+    rejected = [outcome for _, outcome in outcomes if isinstance(outcome, Rejected)]
+    bad = [outcome for outcome in rejected if outcome.reason is Reason.BAD_FRAME]
+    # Not always every one: a later frame may take its place in the slot before the worker comes to it.
+    assert bad
+    assert all("truncated" in outcome.detail and "photo_" in outcome.detail for outcome in bad)
+    # Before the autopilot was found there is no attitude; else nothing is refused.
+    assert {outcome.reason for outcome in rejected} <= {Reason.BAD_FRAME, Reason.BAD_ATTITUDE, Reason.NO_PRIOR}
+    stamps = [outcome.stamp_ns for _, outcome in outcomes]
+    assert stamps == sorted(stamps)
+    counts = daemon.statistics()
+    assert counts["fixes"] + counts["rejected"] == len(outcomes)
+    logged = [msgspec.json.decode(line) for line in (tmp_path / "outcomes.jsonl").read_bytes().splitlines()]
+    assert [line["stamp_ns"] for line in logged] == stamps
+    assert [line["fix"] for line in logged] == [isinstance(outcome, Fix) for _, outcome in outcomes]
+
+
+def test_video_to_autopilot(video: Path, peer: tuple[HoveringAutopilot, str]) -> None:
+    autopilot, endpoint = peer
+    outcomes: list[tuple[Frame | None, Outcome]] = []
+    daemon = Daemon(
+        config(f"video:{video}", endpoint), on_outcome=lambda frame, outcome: outcomes.append((frame, outcome))
+    )
+    with running(daemon):
+        wait_for(lambda: len(autopilot.messages("ODOMETRY")) >= 3, "three ODOMETRY")
+        wait_for(lambda: len(autopilot.messages("VISION_POSITION_ESTIMATE")) >= 3, "three VISION_POSITION_ESTIMATE")
+    check_estimates(autopilot, outcomes)
+    assert all(frame is not None for frame, _ in outcomes)
+
+
+def test_without_an_origin_nothing_is_sent(folder: Path) -> None:
+    """Where the autopilot's zero is, is not ours to guess: it hears why, and no estimate."""
+    wire = UdpWire()
+    autopilot = HoveringAutopilot(wire, with_origin=False)
+    outcomes: list[Outcome] = []
+    daemon = Daemon(
+        config(f"folder:{folder}", f"udpout:127.0.0.1:{wire.port}"),
+        on_outcome=lambda _, outcome: outcomes.append(outcome),
+    )
+    try:
+        with running(daemon):
+            wait_for(lambda: sum(isinstance(o, Fix) for o in list(outcomes)) >= 3, "three fixes")
+            texts = wait_for(
+                lambda: [m.text for m in autopilot.messages("STATUSTEXT") if "origin" in m.text], "the warning"
+            )
+    finally:
+        autopilot.close()
+    assert autopilot.messages("ODOMETRY") == []
+    assert autopilot.messages("VISION_POSITION_ESTIMATE") == []
+    assert autopilot.got_counts["SET_GPS_GLOBAL_ORIGIN"] == 0
+    assert "not sent" in texts[0]
+
+
+def test_origin_is_offered_where_that_is_allowed(folder: Path) -> None:
+    wire = UdpWire()
+    autopilot = HoveringAutopilot(wire, with_origin=False)
+    base = config(f"folder:{folder}", f"udpout:127.0.0.1:{wire.port}")
+    daemon = Daemon(msgspec.structs.replace(base, link=msgspec.structs.replace(base.link, set_origin=True)))
+    try:
+        with running(daemon):
+            wait_for(lambda: autopilot.messages("ODOMETRY"), "an estimate")
+    finally:
+        autopilot.close()
+    (offered, *_) = autopilot.messages("SET_GPS_GLOBAL_ORIGIN")
+    assert offered.latitude == pytest.approx(PLACE.lat_deg * 1e7, abs=500)
+    assert offered.longitude == pytest.approx(PLACE.lon_deg * 1e7, abs=500)
+    assert offered.altitude == pytest.approx(PLACE.height_amsl_m * 1e3, abs=3000)
+    first = autopilot.messages("ODOMETRY")[0]
+    assert np.linalg.norm([first.x, first.y, first.z]) < 3.0
+
+
+def test_end_of_the_frames_ends_the_daemon(tmp_path: Path) -> None:
+    for number in range(2):
+        rendered.write_picture(tmp_path / f"{number}.jpg", rendered.picture(TRUTH))
+    outcomes: list[Outcome] = []
+    wire = UdpWire()
+    try:
+        daemon = Daemon(
+            config(f"folder:{tmp_path}", f"udpout:127.0.0.1:{wire.port}"),
+            on_outcome=lambda _, outcome: outcomes.append(outcome),
+        )
+        daemon.run(threading.Event())
+    finally:
+        wire.close()
+    # Nobody answers, so there is no attitude.
+    assert [o.reason for o in outcomes if isinstance(o, Rejected)] == [Reason.BAD_ATTITUDE] * len(outcomes)
+    assert outcomes
+    assert not [t for t in threading.enumerate() if t.name in ("capture", "recorder", "mavlink")]
+
+
+class _BrokenMatcher:
+    """Fails on every frame after the warm-up."""
+
+    name, model_sha256, working_px = "broken", None, 640
+
+    def __init__(self) -> None:
+        self.calls = itertools.count()
+
+    def extract(self, image: np.ndarray, valid: np.ndarray | None = None) -> Any:
+        if next(self.calls):
+            raise ZeroDivisionError("a bug of ours")
+        return None
+
+    def match(self, query: Any, reference: Any) -> Any:
+        raise AssertionError
+
+
+def test_bug_is_counted_and_then_ends_the_process(tmp_path: Path) -> None:
+    for number in range(40):
+        # Grey and small files: this is not about pictures.
+        rendered.write_picture(tmp_path / f"{number:02d}.jpg", np.zeros((360, 480, 3), np.uint8))
+    wire = UdpWire()
+    autopilot = HoveringAutopilot(wire)
+    outcomes: list[Outcome] = []
+    base = config(f"folder:{tmp_path}", f"udpout:127.0.0.1:{wire.port}")
+    fast = msgspec.structs.replace(base, camera=CameraOptions(source=f"folder:{tmp_path}", rate_hz=8.0))
+    daemon = Daemon(fast, matcher=_BrokenMatcher(), on_outcome=lambda _, outcome: outcomes.append(outcome))
+    try:
+        with pytest.raises(OrtholocError, match=r"5 frames in a row failed.*a bug of ours"):
+            daemon.run(threading.Event())
+    finally:
+        autopilot.close()
+    assert [o.reason for o in outcomes if isinstance(o, Rejected)].count(Reason.INTERNAL) == 5
+
+
+# -- as a process ------------------------------------------------------------
+
+
+def toml(folder: Path, endpoint: str) -> str:
+    camera = rendered.CAMERA
+    return f"""
+[camera]
+source = "folder:{folder}"
+rate_hz = 2.0
+[intrinsics]
+width_px = {camera.width}
+height_px = {camera.height}
+fx = {camera.fx}
+fy = {camera.fy}
+cx = {camera.cx}
+cy = {camera.cy}
+[map]
+pack = "{rendered.store().pack.path}"
+[link]
+endpoint = "{endpoint}"
+[matcher]
+name = "sift"
+"""
+
+
+def test_process_tells_systemd_and_ends_on_sigterm(folder: Path, tmp_path: Path) -> None:
+    wire = UdpWire()
+    autopilot = HoveringAutopilot(wire)
+    path = tmp_path / "config.toml"
+    path.write_text(toml(folder, f"udpout:127.0.0.1:{wire.port}"), encoding="utf-8")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as supervisor:
+        supervisor.bind(str(tmp_path / "notify"))
+        supervisor.settimeout(20.0)
+        process = subprocess.Popen(
+            [sys.executable, "-m", "ortholoc_edge", "run", "--config", str(path)],
+            env={**os.environ, "NOTIFY_SOCKET": str(tmp_path / "notify")},
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        told: list[str] = []
+        try:
+            while "WATCHDOG=1" not in told:
+                told.append(supervisor.recv(4096).decode())
+            assert told[0] == "READY=1"
+            wait_for(lambda: autopilot.messages("ODOMETRY"), "an estimate")
+            started = time.monotonic()
+            process.send_signal(signal.SIGTERM)
+            out, err = process.communicate(timeout=5.0)
+            assert time.monotonic() - started < 5.0
+            while told[-1] != "STOPPING=1":
+                told.append(supervisor.recv(4096).decode())
+        finally:
+            process.kill()
+            process.communicate()
+            autopilot.close()
+    assert process.returncode == 0, err
+    assert out == ""
+    assert "Traceback" not in err
+    assert {told_line.split("=")[0] for told_line in told} <= {"READY", "WATCHDOG", "STATUS", "STOPPING"}
+
+
+def test_silent_without_systemd(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for address in (None, "", "relative", str(tmp_path / "nobody")):
+        if address is None:
+            monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+        else:
+            monkeypatch.setenv("NOTIFY_SOCKET", address)
+        systemd.notify("READY=1")
+    name = f"ortholoc-test-{os.getpid()}"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as abstract:
+        abstract.bind(f"\0{name}")
+        abstract.settimeout(5.0)
+        monkeypatch.setenv("NOTIFY_SOCKET", f"@{name}")
+        systemd.notify("STATUS=flying")
+        assert abstract.recv(100) == b"STATUS=flying"
+
+
+# -- the slot ----------------------------------------------------------------
+
+
+def test_latest_wins_and_the_others_are_counted() -> None:
+    slot: LatestSlot[int] = LatestSlot()
+    assert slot.take(0.0) is None
+    for item in (1, 2, 3):
+        slot.put(item)
+    assert slot.replaced == 2
+    assert slot.take(0.0) == 3
+    assert slot.take(0.0) is None
+    slot.put(4)
+    assert (slot.take(0.0), slot.replaced) == (4, 2)
+
+
+def test_slot_wakes_its_taker() -> None:
+    slot: LatestSlot[str] = LatestSlot()
+    got: list[str | None] = []
+    taker = threading.Thread(target=lambda: got.append(slot.take(10.0)))
+    started = time.monotonic()
+    taker.start()
+    slot.put("frame")
+    taker.join(timeout=5.0)
+    assert got == ["frame"]
+    assert time.monotonic() - started < 5.0
