@@ -1,0 +1,344 @@
+"""The commands as a shell runs them: what they print, where, and with which exit code."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from affine import Affine
+from replay import rendered
+
+from ortholoc_edge.bench import draw
+from ortholoc_edge.bench.replay import PriorKind
+from ortholoc_edge.cli import EXIT_CONFIG, EXIT_FAILED, main
+from ortholoc_edge.geometry.rigid import Rigid3
+
+ROOT = Path(__file__).resolve().parents[2]
+PACK = rendered.store().pack.path
+TRUTH = rendered.pose()
+FLIGHT = [
+    rendered.pose(),
+    rendered.pose(318.0, 262.0, yaw_deg=34.0, roll_deg=4.0),
+    rendered.pose(340.0, 270.0, yaw_deg=41.0, pitch_deg=-6.0),
+]
+SIFT = ("--matcher", "sift")
+
+
+def run(*arguments: object) -> int:
+    return main([str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return rendered.write_flight(tmp_path_factory.mktemp("flight") / "demo", FLIGHT)
+
+
+@pytest.fixture(scope="module")
+def photo(flight: Path) -> Path:
+    return flight / "photos" / "frame_00.jpg"
+
+
+@pytest.fixture(scope="module")
+def intrinsics(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    camera = rendered.CAMERA
+    path = tmp_path_factory.mktemp("camera") / "K.json"
+    keys = {"width_px": camera.width, "height_px": camera.height, "fx": camera.fx, "fy": camera.fy}
+    path.write_text(json.dumps({**keys, "cx": camera.cx, "cy": camera.cy}), encoding="utf-8")
+    return path
+
+
+def position(truth: Rigid3 = TRUTH, off_m: tuple[float, float, float] = (3.0, -2.0, 2.0)) -> str:
+    return ",".join(f"{v:.2f}" for v in truth.translation + off_m)
+
+
+# -- help and errors ---------------------------------------------------------
+
+HELP = [
+    ["sim"], ["run"], ["replay"], ["localize"], ["bench"], ["models", "build"], ["models", "list"],
+    ["tiles", "build"], ["tiles", "info"], ["tiles", "verify"],
+]  # fmt: skip
+# Their only arguments are required, or there are none.
+WITHOUT_DEFAULTS = ("run", "tiles verify")
+
+
+@pytest.mark.parametrize("command", HELP, ids=" ".join)
+def test_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([*command, "--help"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    assert text.startswith("usage: ortholoc-edge")
+    assert "default" in text or " ".join(command) in WITHOUT_DEFAULTS
+    assert "%(" not in text
+
+
+def test_every_command_is_in_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    text = capsys.readouterr().out
+    assert all(re.search(rf"^    {command[0]}\b", text, re.MULTILINE) for command in HELP)
+
+
+def test_usage_errors_are_code_two(capsys: pytest.CaptureFixture[str]) -> None:
+    for wrong in ([], ["fly"], ["localize"], ["replay", "x", "--position-sigma", "5km"]):
+        with pytest.raises(SystemExit) as stop:
+            main(wrong)
+        assert stop.value.code == 2
+    assert "5km" in capsys.readouterr().err
+
+
+def test_entry_as_a_process() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "ortholoc_edge", "tiles", "info", "/nowhere/pack"],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == EXIT_FAILED
+    assert done.stdout == ""
+    assert "/nowhere/pack" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+CONFIG = (ROOT / "config" / "example.toml").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("min_inliers = 30", "min_inlier = 30", r"min_inlier.*\$\.localizer\.gate"),
+        ("working_px = 640", "working_px = 12", r"\$\.matcher\.working_px"),
+        ("[tracker]", "[traker]", "traker"),
+        ("fx = 910.0", 'fx = "long"', r"\$\.intrinsics\.fx"),
+        ('vehicle = "vehicle"', 'vehicle = "a/*"', r"\$\.bus\.vehicle"),
+        ("[camera]", "[camera", "not TOML"),
+    ],
+)
+def test_wrong_configuration(
+    old: str, new: str, named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert CONFIG.count(old) == 1
+    path = tmp_path / "wrong.toml"
+    path.write_text(CONFIG.replace(old, new), encoding="utf-8")
+    assert run("run", "--config", path) == EXIT_CONFIG
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert str(path) in told.err
+    assert re.search(named, told.err)
+
+
+def test_missing_files_are_named(
+    tmp_path: Path, photo: Path, intrinsics: Path, flight: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gone = tmp_path / "gone"
+    cases = [
+        (EXIT_CONFIG, ["run", "--config", gone]),
+        (EXIT_FAILED, ["localize", gone, "--pack", PACK, "--intrinsics", intrinsics, *SIFT]),
+        (EXIT_FAILED, ["localize", photo, "--pack", gone, "--intrinsics", intrinsics, *SIFT]),
+        (EXIT_CONFIG, ["localize", photo, "--pack", PACK, "--intrinsics", gone, *SIFT]),
+        (EXIT_FAILED, ["localize", photo, "--pack", PACK, "--intrinsics", intrinsics, "--model", gone]),
+        (EXIT_FAILED, ["replay", gone, "--pack", PACK, *SIFT]),
+        (EXIT_FAILED, ["replay", flight, "--pack", gone, *SIFT]),
+        (EXIT_FAILED, ["replay", tmp_path, "--pack", PACK, *SIFT]),
+        (EXIT_FAILED, ["tiles", "info", gone]),
+        (EXIT_FAILED, ["tiles", "verify", gone]),
+        (EXIT_FAILED, ["tiles", "build", "--dop", gone, "--dsm", gone, "--out", tmp_path / "out"]),
+        (EXIT_FAILED, ["bench", gone]),
+    ]
+    for code, arguments in cases:
+        assert run(*arguments) == code, arguments
+        told = capsys.readouterr()
+        assert str(gone if gone in arguments else tmp_path) in told.err + told.out, arguments
+        assert "Traceback" not in told.err
+
+
+def test_contradictions(photo: Path, intrinsics: Path, flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = ["localize", photo, "--pack", PACK]
+    cases = [
+        (["--position", "1,2,3", "--geodetic", "1,2,3", "--intrinsics", intrinsics], "--geodetic"),
+        (["--attitude", "0,0,0", "--intrinsics", intrinsics], "--position"),
+        (["--position", "nan,2,3", "--intrinsics", intrinsics], "finite"),
+        ([], "--intrinsics"),
+    ]
+    for more, named in cases:
+        assert run(*given, *more, *SIFT) == EXIT_CONFIG
+        assert named in capsys.readouterr().err
+    assert run("replay", flight, *SIFT) == EXIT_CONFIG
+    assert "--pack" in capsys.readouterr().err
+
+
+# -- tiles -------------------------------------------------------------------
+
+
+def test_tiles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(1)
+    for name, bands, gsd in (
+        ("dop", rng.integers(0, 256, (3, 200, 300), dtype=np.uint8), 0.5),
+        ("dsm", rng.normal(400.0, 2.0, (1, 100, 150)).astype(np.float32), 1.0),
+    ):
+        with rasterio.open(
+            tmp_path / f"{name}.tif", "w", driver="GTiff", width=bands.shape[2], height=bands.shape[1],
+            count=len(bands), dtype=bands.dtype.name, crs="EPSG:32632",
+            transform=Affine(gsd, 0, 500_000.0, 0, -gsd, 5_400_000.0),
+        ) as target:  # fmt: skip
+            target.write(bands)
+    out = tmp_path / "pack"
+    build = ["tiles", "build", "--dop", tmp_path / "dop.tif", "--dsm", tmp_path / "dsm.tif", "--out", out]
+    assert run(*build, "--vertical", "ellipsoid", "--geoid-undulation-m", "47") == 0
+    assert "EPSG:32632" in capsys.readouterr().out
+    assert run("tiles", "info", out, "--json") == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["dop"]["size_px"] == [300, 200]
+    assert facts["vertical"]["amsl_minus_map_m"] == -47.0
+    assert run("tiles", "verify", out) == 0
+    assert "sound" in capsys.readouterr().out
+    assert run(*build) == EXIT_FAILED
+    assert "--force" in capsys.readouterr().err
+
+
+# -- localize ----------------------------------------------------------------
+
+
+def test_localize_json_and_overlay(
+    photo: Path, intrinsics: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    picture = tmp_path / "overlay.png"
+    code = run(
+        "localize", photo, "--pack", PACK, "--intrinsics", intrinsics, "--position", position(),
+        "--attitude", "1,-1,32", "--json", "--overlay", picture, *SIFT,
+    )  # fmt: skip
+    assert code == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["fix"] is True
+    assert np.linalg.norm(record["position_map_m"] - TRUTH.translation) < 2.0
+    assert record["attitude_rpy_true_north_deg"] == pytest.approx([0.0, 0.0, 30.0], abs=1.5)
+    place = rendered.georeference().geodetic_from_map(TRUTH.translation)
+    assert record["latitude_deg"] == pytest.approx(place.lat_deg, abs=2e-5)
+    assert record["longitude_deg"] == pytest.approx(place.lon_deg, abs=3e-5)
+    assert record["height_amsl_m"] == pytest.approx(place.height_amsl_m, abs=2.0)
+    drawn = cv2.imread(str(picture))[..., ::-1]
+    assert drawn.shape[1] == rendered.CAMERA.width
+    assert drawn.shape[0] > rendered.CAMERA.height
+    # No truth is known here: estimates only.
+    assert coloured(drawn, draw.ESTIMATE) > 100
+    assert coloured(drawn, draw.TRUTH) == 0
+
+
+def coloured(image: np.ndarray, colour: tuple[int, int, int]) -> int:
+    return int((image == colour).all(axis=-1).sum())
+
+
+def test_localize_for_people(photo: Path, intrinsics: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    place = rendered.georeference().geodetic_from_map(TRUTH.translation)
+    where = f"{place.lat_deg},{place.lon_deg},{place.height_amsl_m}"
+    given = ["localize", photo, "--pack", PACK, "--intrinsics", intrinsics, "--geodetic", where]
+    assert run(*given, "--attitude", "0,0,30", "--position-sigma", "4%", *SIFT) == 0
+    text = capsys.readouterr().out
+    east, north = (float(v) for v in re.search(r"fix: E ([\d.]+) N ([\d.]+)", text).groups())
+    assert np.hypot(*(TRUTH.translation[:2] - (east, north))) < 2.0
+    assert "above sea level" in text
+    # Half a turn off: no fix, and why.
+    assert run(*given, "--attitude", "0,0,210", *SIFT) == EXIT_FAILED
+    assert capsys.readouterr().out.startswith("no fix: ")
+
+
+def test_localize_without_a_prior(photo: Path, intrinsics: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The whole pack as the region: an answer of whichever kind, and never a wrong one."""
+    code = run("localize", photo, "--pack", PACK, "--intrinsics", intrinsics, "--json", *SIFT)
+    record = json.loads(capsys.readouterr().out)
+    assert record["fix"] is (code == 0)
+    if code == 0:
+        assert np.linalg.norm(record["position_map_m"] - TRUTH.translation) < 10.0
+
+
+# -- replay ------------------------------------------------------------------
+
+KEYS = {
+    "frames", "fixes", "rejected", "te_m", "re_deg", "recall", "false_fixes", "nees", "latency_ms", "rss_mb",
+    "matcher", "model_sha256", "pack",
+}  # fmt: skip
+
+
+def test_replay_json_and_files(flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "results"
+    assert run("replay", flight, "--pack", PACK, "--json", "--out", out, *SIFT) == 0
+    told = capsys.readouterr()
+    (line,) = told.out.splitlines()
+    summary = json.loads(line)
+    assert summary.keys() >= KEYS
+    assert (summary["frames"], summary["fixes"], summary["rejected"]) == (3, 3, {})
+    for key in ("te_m", "re_deg"):
+        assert set(summary[key]) == {"median", "p90", "p99", "max"}
+    assert summary["te_m"]["max"] < 2.0
+    assert set(summary["recall"]) == {"1m_1deg", "3m_3deg", "5m_5deg"}
+    assert summary["recall"]["3m_3deg"] == 1.0
+    assert summary["false_fixes"] == 0
+    assert {"mean", "p95"} <= set(summary["nees"])
+    assert {"total", "query_features", "match", "pose"} <= set(summary["latency_ms"])
+    assert all(set(spent) == {"median", "p95", "p99"} for spent in summary["latency_ms"].values())
+    assert summary["rss_mb"] > 10
+    assert (summary["matcher"], summary["model_sha256"]) == ("sift", None)
+    assert summary["pack"] == str(PACK)
+    assert json.loads((out / "summary.json").read_text("utf-8")) == summary
+
+    records = [json.loads(one) for one in (out / "frames.jsonl").read_text("utf-8").splitlines()]
+    assert [record["name"] for record in records] == ["frame_00", "frame_01", "frame_02"]
+    for record, truth in zip(records, FLIGHT, strict=True):
+        assert record["te_m"] == pytest.approx(np.linalg.norm(record["position_map_m"] - truth.translation), abs=1e-6)
+        overlay = cv2.imread(str(out / "overlays" / f"{record['name']}.png"))[..., ::-1]
+        assert coloured(overlay, draw.ESTIMATE) > 50
+        assert coloured(overlay, draw.TRUTH) > 50
+    track = cv2.imread(str(out / "track.png"))[..., ::-1]
+    assert coloured(track, draw.TRUTH) > 20
+    assert coloured(track, draw.ESTIMATE) > 20
+
+
+@pytest.mark.parametrize("kind", list(PriorKind))
+def test_replay_with_each_prior(kind: PriorKind, flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = ["--prior", kind, "--position-sigma", "3%", "--height-sigma", "2m", "--seed", "4", "--no-adhop"]
+    assert run("replay", flight, "--pack", PACK, "--json", *given, *SIFT) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert (summary["prior"], summary["seed"], summary["adhop"]) == (str(kind), 4, False)
+    assert summary["fixes"] == 3
+    assert summary["te_m"]["max"] < 5.0
+
+
+def test_replay_table(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("replay", flight, "--pack", PACK, "--no-adhop", *SIFT) == 0
+    text = capsys.readouterr().out
+    for word in ("recall", "1m-1deg", "position error", "false fixes", "latency total", "peak memory"):
+        assert word in text
+
+
+@pytest.mark.parametrize("kind", ["number", "pair"])
+def test_replay_of_an_ortholoc_sample(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """In a frame of its own, as OrthoLoC's are: the corner of the window is zero."""
+    east, north, _ = TRUTH.translation
+    window = rendered.store().read((east - 60, north - 60, east + 60, north + 60), 0.25, 0.25)
+    assert window is not None
+    grid = window.dop_grid
+    u, v = np.meshgrid(np.arange(grid.width), np.arange(grid.height))
+    xy = grid.map_from_px(np.stack([u, v], axis=-1))
+    heights = rendered.store().heights(xy.reshape(-1, 2)).reshape(u.shape)
+    origin = np.array([grid.west, grid.top, 0.0])
+    truth = Rigid3(TRUTH.rotation, TRUTH.translation - origin)
+    inverse = truth.inverse()
+    np.savez(
+        tmp_path / "sample.npz",
+        image_query=rendered.picture(TRUTH),
+        image_dop=window.dop,
+        dsm=(np.dstack([xy, heights]) - origin).astype(np.float32),
+        scale=np.array(grid.dx) if kind == "number" else np.array([grid.dx, grid.dy]),
+        extrinsics=np.column_stack([inverse.rotation, inverse.translation]),
+        intrinsics=rendered.CAMERA.matrix,
+    )
+    assert run("replay", tmp_path / "sample.npz", "--json", "--prior", "none", *SIFT) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert (summary["frames"], summary["fixes"]) == (1, 1)
+    assert summary["te_m"]["max"] < 3.0
+    assert summary["re_deg"]["max"] < 2.0
