@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import math
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -23,6 +24,9 @@ from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
 from ortholoc_edge.pipeline.tracker import TrackerOptions
 
+# The coarsest level of XFeat's network is at 1/32.
+_XFEAT_MULTIPLE_PX = 32
+
 
 class Intrinsics(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A pinhole camera with OpenCV's distortion (k1, k2, p1, p2, k3); pixel centres at integers."""
@@ -34,6 +38,10 @@ class Intrinsics(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     cx: float
     cy: float
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        # Built once here: msgspec names the table, and nothing fails later in the air.
+        self.camera()
 
     def camera(self) -> Camera:
         return Camera(self.width_px, self.height_px, self.fx, self.fy, self.cx, self.cy, self.distortion)
@@ -54,6 +62,9 @@ class MountOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     pitch_deg: float = 0.0
     yaw_deg: float = 0.0
     lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        self.body_from_camera()
 
     def body_from_camera(self) -> Rigid3:
         preset = frames.BODY_FROM_NADIR_CAMERA if self.preset == "nadir-nose-up" else frames.BODY_FROM_FORWARD_CAMERA
@@ -77,7 +88,7 @@ class MapOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class MatcherOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Which matcher. ``model``: a file instead of the built one; ``model_sha256``: what it must hash to.
 
-    ``working_px``: long side at which frames are matched: time grows with its square.
+    ``working_px``: long side at which frames are matched: time grows with its square. A multiple of 32 for xfeat.
     """
 
     name: str = "xfeat"
@@ -86,6 +97,14 @@ class MatcherOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     threads: Annotated[int, Meta(ge=1, le=64)] = 1
     model: str | None = None
     model_sha256: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.name == "xfeat" and self.working_px % _XFEAT_MULTIPLE_PX:
+            below = self.working_px - self.working_px % _XFEAT_MULTIPLE_PX
+            raise ValueError(
+                f"working_px = {self.working_px} is no multiple of {_XFEAT_MULTIPLE_PX}, as the matcher xfeat needs; "
+                f"write {below} or {below + _XFEAT_MULTIPLE_PX}"
+            )
 
 
 class AttitudeOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -101,7 +120,7 @@ class AttitudeOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 class LogOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Where every outcome is written as a line of JSON; nowhere if ``folder`` is left out."""
 
-    folder: str | None = None
+    folder: Annotated[str, Meta(min_length=1)] | None = None
     max_mb: Annotated[int, Meta(ge=1)] = 256
 
 
@@ -131,11 +150,45 @@ def read_config(path: Path) -> Config:
     except (OSError, UnicodeDecodeError) as err:
         raise ConfigError(f"{path}: can't be read ({err})") from err
     try:
-        return msgspec.convert(tomllib.loads(text), Config)
+        raw = tomllib.loads(text)
+        # Before the tables are made: they would name only themselves, not the key.
+        _raise_first(path, _not_finite(raw, "$"))
+        config = msgspec.convert(raw, Config)
     except tomllib.TOMLDecodeError as err:
         raise ConfigError(f"{path}: not TOML: {err}") from err
     except msgspec.ValidationError as err:
         raise ConfigError(f"{path}: {err}; see config/example.toml for what is allowed") from err
+    _raise_first(path, _contradictions(config))
+    return config
+
+
+def _raise_first(path: Path, problems: Iterator[str]) -> None:
+    for problem in problems:
+        raise ConfigError(f"{path}: {problem}")
+
+
+def _not_finite(value: Any, key: str) -> Iterator[str]:
+    """TOML knows nan and inf, and no bound of a range holds nan back."""
+    if isinstance(value, dict):
+        for name, part in value.items():
+            yield from _not_finite(part, f"{key}.{name}")
+    elif isinstance(value, list | tuple):
+        for index, part in enumerate(value):
+            yield from _not_finite(part, f"{key}[{index}]")
+    elif isinstance(value, float) and not math.isfinite(value):
+        yield f"`{key}` is {value}; write a finite number"
+
+
+def _contradictions(config: Config) -> Iterator[str]:
+    if not config.link.send:
+        yield "`$.link.send` is empty, so no fix would reach the autopilot; name odometry or vision_position_estimate"
+    for side in ("width_px", "height_px"):
+        asked, calibrated = getattr(config.camera, side), getattr(config.intrinsics, side)
+        if asked is not None and asked != calibrated:
+            yield (
+                f"`$.camera.{side}` asks for {asked}, but `$.intrinsics.{side}` is {calibrated}; intrinsics must be "
+                "those of the frames as they arrive"
+            )
 
 
 def read_intrinsics(path: Path, width: int, height: int) -> Camera:

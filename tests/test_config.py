@@ -1,0 +1,138 @@
+"""What the configuration refuses: by file and key, before anything is opened."""
+
+from __future__ import annotations
+
+import json
+import socket
+from pathlib import Path
+
+import pytest
+
+from ortholoc_edge.adapters.bus import Bus, BusOptions
+from ortholoc_edge.config import read_config, read_intrinsics
+from ortholoc_edge.errors import ConfigError, LinkError
+from ortholoc_edge.pipeline.outcome import Reason, Rejected
+
+EXAMPLE = (Path(__file__).resolve().parents[1] / "config" / "example.toml").read_text(encoding="utf-8")
+
+
+def write(folder: Path, *changes: tuple[str, str]) -> Path:
+    text = EXAMPLE
+    for old, new in changes:
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
+    path = folder / "drone.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        # Not finite.
+        ("latency_ms = 45.0", "latency_ms = nan", r"camera\.latency_ms"),
+        ("rate_hz = 10.0 ", "rate_hz = nan ", r"camera\.rate_hz"),
+        ("fx = 910.0", "fx = nan", r"intrinsics\.fx"),
+        ("cy = 359.5", "cy = inf", r"intrinsics\.cy"),
+        ("[0.0, 0.0, 0.0, 0.0, 0.0]", "[0.0, 0.0, nan, 0.0, 0.0]", r"intrinsics\.distortion\[2\]"),
+        ("roll_deg = 0.0", "roll_deg = nan", r"mount\.roll_deg"),
+        ("lever_arm_m = [0.0, 0.0, 0.0]", "lever_arm_m = [0.0, 0.0, -inf]", r"mount\.lever_arm_m\[2\]"),
+        ("search_sigmas = 2.5", "search_sigmas = nan", r"localizer\.search_sigmas"),
+        ("homography_threshold_px = 5.0", "homography_threshold_px = inf", r"localizer\.homography_threshold_px"),
+        ("min_spread = 0.12", "min_spread = nan", r"localizer\.gate\.min_spread"),
+        ("max_innovation_sigmas = 5.0", "max_innovation_sigmas = inf", r"localizer\.gate\.max_innovation_sigmas"),
+        ("odometry_drift_m_per_s = 0.2", "odometry_drift_m_per_s = inf", r"tracker\.odometry_drift_m_per_s"),
+        ("lost_sigma_m = 150.0", "lost_sigma_m = nan", r"tracker\.lost_sigma_m"),
+        ("sigma_deg = [1.0, 1.0, 3.0]", "sigma_deg = [1.0, nan, 3.0]", r"attitude\.sigma_deg\[1\]"),
+        ("attitude_rate_hz = 50.0", "attitude_rate_hz = nan", r"link\.attitude_rate_hz"),
+        pytest.param("fx = 910.0", "fx = 1" + 400 * "0", r"intrinsics", id="too large for a float"),
+        # Out of range or of the wrong kind.
+        ("fy = 910.0", "fy = -910.0", r"\$\.intrinsics\.fy"),
+        ("width_px = 1280\nheight", "width_px = 0\nheight", r"\$\.intrinsics\.width_px"),
+        ('"nadir-nose-up" ', '"sideways" ', r"\$\.mount\.preset"),
+        ('send = ["odometry"]', "send = []", r"link\.send"),
+        ('folder = "/var/log/ortholoc-edge"', 'folder = ""', r"\$\.log\.folder"),
+        ("working_px = 640", "working_px = 650", r"no multiple of 32.*640 or 672.*\$\.matcher"),
+        # One table against another.
+        ("# width_px = 1280", "width_px = 640", r"camera\.width_px.* 640.*intrinsics\.width_px.* 1280"),
+        ("# height_px = 720", "height_px = 1080", r"camera\.height_px.* 1080.*intrinsics\.height_px.* 720"),
+    ],
+)
+def test_refused_with_file_and_key(old: str, new: str, named: str, tmp_path: Path) -> None:
+    path = write(tmp_path, (old, new))
+    with pytest.raises(ConfigError, match=named) as raised:
+        read_config(path)
+    assert str(path) in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        [],
+        [("# width_px = 1280", "width_px = 1280"), ("# height_px = 720", "height_px = 720")],
+        [('name = "xfeat"', 'name = "sift"'), ("working_px = 640", "working_px = 650")],
+        [('folder = "/var/log/ortholoc-edge"', "")],
+        [('preset = "nadir-nose-up"', 'preset = "forward"'), ("pitch_deg = 0.0", "pitch_deg = -60")],
+    ],
+)
+def test_accepted(changes: list[tuple[str, str]], tmp_path: Path) -> None:
+    config = read_config(write(tmp_path, *changes))
+    assert config.intrinsics.camera().width == 1280
+    assert config.mount.body_from_camera().translation.tolist() == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfe", b"[camera", b""])
+def test_no_configuration_at_all(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "drone.toml"
+    path.write_bytes(content)
+    with pytest.raises(ConfigError, match=r"drone\.toml"):
+        read_config(path)
+    with pytest.raises(ConfigError, match="nowhere"):
+        read_config(tmp_path / "nowhere.toml")
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [
+        {"width_px": 640, "height_px": 480, "fx": float("nan"), "fy": 500, "cx": 319.5, "cy": 239.5},
+        {"width_px": 640, "height_px": 480, "fx": 500, "fy": 500, "cx": 319.5, "cy": float("inf")},
+        {"width_px": 640, "height_px": 480, "fx": 500},
+        {"intrinsics": [[500, 0, float("nan")], [0, 500, 200], [0, 0, 1]]},
+        {"intrinsics": [[500, 0], [0, 500]]},
+        {"intrinsics": [[-1, 0, 300], [0, 500, 200], [0, 0, 1]]},
+        [1, 2, 3],
+    ],
+)
+def test_wrong_intrinsics_name_the_file(raw: object, tmp_path: Path) -> None:
+    path = tmp_path / "K.json"
+    path.write_text(json.dumps(raw), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"K\.json"):
+        read_intrinsics(path, 640, 480)
+
+
+# -- the bus: what a restart may mend, and what it can't -----------------------
+
+
+def test_a_port_in_use_is_no_mistake_of_the_configuration() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        endpoint = f"tcp/127.0.0.1:{server.getsockname()[1]}"
+        with pytest.raises(LinkError, match=r"127\.0\.0\.1.*\[bus\]"):
+            Bus(BusOptions(enabled=True, listen=(endpoint,)))
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    ["", "nonsense", "tcp/", "tcp/127.0.0.1", "tcp/127.0.0.1:99999", "tcp/127.0.0.1:abc", "foo/h:7", "udp/:7"],
+)
+def test_a_malformed_endpoint_is(endpoint: str) -> None:
+    with pytest.raises(ConfigError, match=r"endpoint.*\[bus\]"):
+        Bus(BusOptions(enabled=True, listen=(endpoint,)))
+
+
+def test_outcomes_that_were_not_published_are_counted() -> None:
+    bus = Bus(BusOptions(enabled=True, listen=("tcp/127.0.0.1:0",)))
+    bus.publish(Rejected(1, Reason.LATE))
+    assert bus.dropped == 0
+    bus.close()
+    bus.publish(Rejected(2, Reason.LATE))
+    assert bus.dropped == 1
