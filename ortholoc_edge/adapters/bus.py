@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 from typing import Annotated
 
 import msgspec
 import zenoh
 from msgspec import Meta, Struct
 
-from ortholoc_edge.errors import ConfigError
+from ortholoc_edge.errors import ConfigError, LinkError
 from ortholoc_edge.pipeline.outcome import Fix, Outcome
 from ortholoc_edge.pipeline.record import outcome_record
 
 logger = logging.getLogger(__name__)
+
+_PORT_PROTOCOLS = frozenset({"tcp", "udp", "tls", "quic", "ws"})
+_OTHER_PROTOCOLS = frozenset({"serial", "unixsock-stream", "unixpipe", "vsock"})
+_MAX_PORT = 65535
 
 
 class BusOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -35,39 +40,77 @@ class BusOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class Bus:
     """A zenoh session that publishes; never blocks the caller for a slow subscriber.
 
-    Raises on construction: ConfigError if the session can't be opened with these options.
+    Attributes:
+        dropped: outcomes that could not be published.
+    Raises on construction: ConfigError if an endpoint is malformed; LinkError if the session can't be opened, which
+        may pass (a port still in use, an interface that is not up yet).
     """
 
     def __init__(self, options: BusOptions) -> None:
-        config = zenoh.Config()
-        prefix = f"ortholoc/{options.vehicle}"
+        self.dropped = 0
+        self._prefix = f"ortholoc/{options.vehicle}"
+        config = _session_config(options)
         try:
-            config.insert_json5("mode", '"peer"')
-            config.insert_json5("scouting/multicast/enabled", "false")
-            config.insert_json5("listen/endpoints", json.dumps(list(options.listen)))
             self._session = zenoh.open(config)
-            self._token = self._session.liveliness().declare_token(f"{prefix}/alive")
+        except zenoh.ZError as err:
+            raise self._not_open(options, err) from err
+        try:
+            self._token = self._session.liveliness().declare_token(f"{self._prefix}/alive")
             self._publishers = {
                 name: self._session.declare_publisher(
-                    f"{prefix}/{name}",
+                    f"{self._prefix}/{name}",
                     encoding=zenoh.Encoding.APPLICATION_JSON,
                     congestion_control=zenoh.CongestionControl.DROP,
                 )
                 for name in ("fix", "rejection")
             }
         except zenoh.ZError as err:
-            raise ConfigError(
-                f"zenoh can't listen on {', '.join(options.listen)} as {prefix!r} ({err}); see [bus] in the "
-                "configuration"
-            ) from err
+            self.close()
+            raise self._not_open(options, err) from err
+
+    def _not_open(self, options: BusOptions, err: zenoh.ZError) -> LinkError:
+        return LinkError(
+            f"zenoh can't listen on {', '.join(options.listen)} as {self._prefix!r} ({err}); free the port, or choose "
+            "another in [bus] of the configuration"
+        )
 
     def publish(self, outcome: Outcome) -> None:
-        """Send an outcome to whoever listens. A failure is logged, never raised: the flight goes on."""
+        """Send an outcome to whoever listens. A failure is counted and logged, never raised: the flight goes on."""
         name = "fix" if isinstance(outcome, Fix) else "rejection"
         try:
             self._publishers[name].put(msgspec.json.encode(outcome_record(outcome)))
         except zenoh.ZError:
+            self.dropped += 1
             logger.warning("zenoh: %s not published", name, exc_info=True)
 
     def close(self) -> None:
         self._session.close()  # type: ignore[no-untyped-call]
+
+
+def _session_config(options: BusOptions) -> zenoh.Config:
+    """Raises: ConfigError naming the endpoint that is malformed."""
+    for endpoint in options.listen:
+        if not _well_formed(endpoint):
+            raise ConfigError(
+                f"zenoh endpoint {endpoint!r} can't be used; write tcp/HOST:PORT or udp/HOST:PORT in [bus] of the "
+                "configuration"
+            )
+    config = zenoh.Config()
+    try:
+        config.insert_json5("mode", '"peer"')
+        config.insert_json5("scouting/multicast/enabled", "false")
+        config.insert_json5("listen/endpoints", json.dumps(list(options.listen)))
+    except zenoh.ZError as err:
+        raise ConfigError(
+            f"zenoh refuses to listen on {', '.join(options.listen)} ({err}); see [bus] in the configuration"
+        ) from err
+    return config
+
+
+def _well_formed(endpoint: str) -> bool:
+    """Checked here since zenoh tells of a bad port or protocol only as it tells of a port in use."""
+    protocol, _, address = endpoint.partition("/")
+    if protocol in _OTHER_PROTOCOLS:
+        return bool(address)
+    match = re.fullmatch(r"[^?#]+:(\d{1,5})([?#].*)?", address)
+    return protocol in _PORT_PROTOCOLS and match is not None and int(match[1]) <= _MAX_PORT
