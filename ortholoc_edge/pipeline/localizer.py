@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Annotated
@@ -140,22 +141,29 @@ class Localizer:
     def close(self) -> None:
         self._worker.shutdown()
 
-    def localize(self, frame: Frame, prior: PosePrior | RegionPrior) -> Outcome:
-        """The frame's pose, or why there is none. Raises ModelError if the matcher itself fails."""
+    def localize(
+        self, frame: Frame, prior: PosePrior | RegionPrior, proceed: Callable[[], bool] = lambda: True
+    ) -> Outcome:
+        """The frame's pose, or why there is none.
+
+        Args:
+            proceed: asked before each further hypothesis of a wide prior; False ends the search as LATE.
+        Raises: ModelError if the matcher itself fails.
+        """
         trace = Trace()
         try:
-            return self._localize(frame, prior, trace)
+            return self._localize(frame, prior, proceed, trace)
         except _RejectedError as stop:
             return Rejected(frame.stamp_ns, stop.reason, stop.detail, stop.measured, stop.limit, trace.timings_ms())
         except MapError as error:
             # One damaged tile must not end the flight: elsewhere the pack is good.
             return Rejected(frame.stamp_ns, Reason.MAP_DAMAGED, str(error), timings_ms=trace.timings_ms())
 
-    def _localize(self, frame: Frame, prior: PosePrior | RegionPrior, trace: Trace) -> Fix:
+    def _localize(self, frame: Frame, prior: PosePrior | RegionPrior, proceed: Callable[[], bool], trace: Trace) -> Fix:
         grey = self._checked_grey(frame)
         query = self._worker.submit(self._query_features, grey, trace)
         try:
-            scene, first = self._first_round(query, prior, trace)
+            scene, first = self._first_round(query, prior, proceed, trace)
             second = None
             if self._options.adhop:
                 with trace.stage("adhop"):
@@ -201,7 +209,9 @@ class Localizer:
             )
         return found
 
-    def _scene_of_pose(self, prior: PosePrior, ground: tuple[float, FloatArray] | None, trace: Trace) -> _Scene:
+    def _scene_of_pose(
+        self, prior: PosePrior, ground: tuple[float, FloatArray] | None, widen: bool, trace: Trace
+    ) -> _Scene:
         with trace.stage("map_window"):
             ground_m, outline = ground or self._predicted_ground(prior)
             gsd_m = self._distance_to_ground(prior, ground_m) / self._working.focal_px
@@ -212,7 +222,7 @@ class Localizer:
             plane = precondition.ground_plane(window, local, outline)
             if plane is None:
                 raise _RejectedError(Reason.MAP_NODATA, "the surface model has no data under the predicted view")
-            view = precondition.predicted_view(window, dop_grey, local, plane, self._working, prior)
+            view = precondition.predicted_view(window, dop_grey, local, plane, self._working, prior, widen)
             if not view.valid.any():
                 raise _RejectedError(Reason.MAP_NODATA, "the orthophoto has no data in the predicted view")
         return _Scene(window, dop_grey, local, ground_m, [view])
@@ -290,21 +300,26 @@ class Localizer:
     # -- matching and pose -----------------------------------------------------------------------------
 
     def _first_round(
-        self, query: Future[Features], prior: PosePrior | RegionPrior, trace: Trace
+        self, query: Future[Features], prior: PosePrior | RegionPrior, proceed: Callable[[], bool], trace: Trace
     ) -> tuple[_Scene, _Round]:
         """The best of what there is to try; the first that convinces ends the search."""
         if isinstance(prior, RegionPrior):
             scene = self._scene_of_region(prior, trace)
             return scene, self._round(query, scene, trace)
-        best: tuple[_Scene, _Round] | None = None
-        refused: _RejectedError | None = None
         with trace.stage("map_window"):
             ground = self._predicted_ground(prior)
-        for hypothesis in self._hypotheses(prior, ground[1]):
+        best: tuple[_Scene, _Round] | None = None
+        refused: _RejectedError | None = None
+        for number, (hypothesis, widen) in enumerate(self._attempts(prior, ground[1])):
+            if number > 0 and not proceed():
+                raise _RejectedError(Reason.LATE, f"{number} hypotheses were tried without one that convinces")
             try:
-                scene = self._scene_of_pose(hypothesis, ground if hypothesis is prior else None, trace)
+                scene = self._scene_of_pose(hypothesis, ground if hypothesis is prior else None, widen, trace)
             except _RejectedError as error:
                 refused = refused or error
+                continue
+            if number > 0 and hypothesis is prior and scene.views[0].margin_px == 0:
+                # Not wide enough to be widened: this is the first attempt again.
                 continue
             found = self._round(query, scene, trace)
             if best is None or found.inliers > best[1].inliers:
@@ -312,8 +327,15 @@ class Localizer:
             if found.inliers >= _CONVINCING_INLIERS and found.inliers >= _CONVINCING_RATIO * len(found.kept):
                 break
         if best is None:
-            raise refused or _RejectedError(Reason.NO_PRIOR, "nothing to look at")
+            raise refused or _RejectedError(Reason.PRIOR_TOO_WIDE, "there is nothing to look at")
         return best
+
+    def _attempts(self, prior: PosePrior, outline: FloatArray) -> Iterator[tuple[PosePrior, bool]]:
+        """Priors to look from, and whether the view is to show more than the camera. The plain predicted view
+        comes first, whatever the prior says: a wider picture is a smaller one, and matches less."""
+        yield prior, False
+        for hypothesis in self._hypotheses(prior, outline):
+            yield hypothesis, True
 
     def _round(self, query: Future[Features], scene: _Scene, trace: Trace) -> _Round:
         """Match all pictures of a scene and solve the one with the most matches (paper: "selecting the one
@@ -392,7 +414,7 @@ class Localizer:
 
     def _pose(self, points_local: FloatArray, query_px: FloatArray) -> pnp.PoseEstimate | None:
         if self._options.calibrate:
-            return calibrate.solve(points_local, query_px, self.camera.width, self.camera.height)
+            return calibrate.solve(points_local, query_px, self.camera)
         return pnp.solve(points_local, query_px, self.camera, max_error_px=self._max_error_px)
 
     # -- judgement -------------------------------------------------------------------------------------

@@ -142,16 +142,18 @@ def predicted_view(
     plane: GroundPlane,
     camera: Camera,
     prior: PosePrior,
+    widen: bool,
 ) -> ReferenceView:
-    """The orthophoto as the camera should see it, and somewhat more where the prediction is uncertain.
+    """The orthophoto as the camera should see it.
 
     Args:
         camera: pinhole at the working size.
+        widen: show somewhat more where the prediction is uncertain.
     """
     local_from_camera = local.local_from_map_pose(prior.map_from_camera)
     shift_px = _predicted_shift(camera, local_from_camera, plane, prior)
     # A shift of a tenth of the picture costs overlap that can be spared; beyond it, look wider.
-    widening = 0.5 * shift_px / camera.width - 0.1
+    widening = 0.5 * shift_px / camera.width - 0.1 if widen else 0.0
     margin = round(min(max(widening, 0.0), _MAX_WIDENING) * max(camera.width, camera.height))
     wide = camera.padded(margin)
     matrix = view_homography(window, local, plane.abc, wide, local_from_camera)

@@ -19,6 +19,9 @@ from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.prior import PosePrior
 from ortholoc_edge.tiles.georeference import Georeference
 
+# Between GNSS and the chain of fixes, over position.
+_CONTRADICTION_SIGMAS = 4.0
+
 
 class TrackerOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How fast the prediction loses certainty between fixes.
@@ -47,26 +50,38 @@ class TrackerStatus(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Anchor:
-    """Where the body was at the last fix, and what the odometry said then."""
+    """Where the body was at the last fix (or the last trusted GNSS position), and what the odometry said then."""
 
     stamp_ns: int
     position_map_m: FloatArray
     covariance: FloatArray
     odometry_ned_m: FloatArray | None
     odometry_epoch: int
+    from_fix: bool
 
 
 class Tracker:
     """Predicts a `PosePrior` for each frame and learns from its outcome; used by one thread."""
 
-    def __init__(self, georeference: Georeference, body_from_camera: Rigid3, options: TrackerOptions) -> None:
+    def __init__(
+        self,
+        georeference: Georeference,
+        body_from_camera: Rigid3,
+        options: TrackerOptions,
+        first_reset_counter: int = 0,
+    ) -> None:
+        """
+        Args:
+            first_reset_counter: another one in every life of the program: an autopilot that has seen a value takes
+                it again as "no reset".
+        """
         self._georeference = georeference
         self._body_from_camera = body_from_camera
         self._options = options
         self._anchor: _Anchor | None = None
         self._last_prior: PosePrior | None = None
         self.status = TrackerStatus.SEARCH
-        self.reset_counter = 0
+        self.reset_counter = first_reset_counter % 256
 
     def predict(self, state: VehicleState) -> PosePrior | Rejected:
         """The pose to expect at the state's stamp, or why there is none."""
@@ -76,21 +91,19 @@ class Tracker:
             return Rejected(
                 state.stamp_ns, Reason.BAD_ATTITUDE, "no finite attitude from the autopilot at the exposure"
             )
+        self._take_absolute(state)
         carried = self._carried(state)
-        absolute = self._absolute(state)
-        known = [p for p in (carried, absolute) if p is not None and _sigma(p[1]) <= self._options.lost_sigma_m]
-        if not known:
-            detail = "no fix yet and no position from the autopilot"
-            if carried is not None:
-                detail = "the last fix is too old to predict from; horizontal 1-sigma, m"
+        if carried is None:
+            return Rejected(state.stamp_ns, Reason.NO_PRIOR, "no fix yet and no position from the autopilot")
+        position, position_covariance = carried
+        if _sigma(position_covariance) > self._options.lost_sigma_m:
             return Rejected(
                 state.stamp_ns,
                 Reason.NO_PRIOR,
-                detail,
-                None if carried is None else _sigma(carried[1]),
+                "the last known position is too old to predict from; horizontal 1-sigma, m",
+                _sigma(position_covariance),
                 self._options.lost_sigma_m,
             )
-        position, position_covariance = min(known, key=lambda p: _sigma(p[1]))
         map_from_ned = frames.map_from_ned_rotation(self._georeference.convergence_rad(position[:2]))
         body = Rigid3(map_from_ned @ attitude, position)
         covariance = np.zeros((6, 6))
@@ -114,14 +127,7 @@ class Tracker:
         body = outcome.map_from_camera @ self._body_from_camera.inverse()
         lever = body.translation - outcome.map_from_camera.translation
         covariance = cov.of_moved_point(outcome.covariance, lever)
-        odometry = state.odometry_ned_m
-        self._anchor = _Anchor(
-            state.stamp_ns,
-            body.translation,
-            covariance[:3, :3],
-            None if odometry is None or not np.isfinite(odometry).all() else odometry,
-            state.odometry_epoch,
-        )
+        self._anchor = _anchor(state, body.translation, covariance[:3, :3], from_fix=True)
         self.status = TrackerStatus.TRACK
 
     def _jumped(self, fix: Fix) -> bool:
@@ -159,16 +165,36 @@ class Tracker:
         )
         return anchor.position_map_m + step, anchor.covariance + np.eye(3) * sigma_m**2
 
-    def _absolute(self, state: VehicleState) -> tuple[FloatArray, FloatArray] | None:
-        """A trusted position of the autopilot's own."""
-        position = state.position_map_m
-        if position is None or not np.isfinite(position).all():
-            return None
-        horizontal_m, vertical_m = state.position_sigma_m
-        # Of NaN, eigvalsh makes zero: the most certain position of all.
-        if not (math.isfinite(horizontal_m) and math.isfinite(vertical_m)):
-            return None
-        return position, np.diag(np.square([horizontal_m, horizontal_m, vertical_m]))
+    def announce_jump(self) -> None:
+        """The next estimate starts anew for the autopilot: its origin moved, or it restarted."""
+        self.reset_counter = (self.reset_counter + 1) % 256
+
+    def _take_absolute(self, state: VehicleState) -> None:
+        """Anchor at a trusted position of the autopilot's own (GNSS), if it is worth more than what we have.
+
+        It is kept as an anchor, so that there is something to carry on when GNSS ends before the first fix. One
+        that contradicts the chain of fixes is left alone: a spoofed receiver must not switch the camera off. The
+        chain's own uncertainty grows until the two agree, if it was the chain that was wrong.
+        """
+        position, sigma_m = state.position_map_m, state.position_sigma_m
+        # A NaN sigma would pass for the most certain position of all.
+        if position is None or not (np.isfinite(position).all() and np.isfinite(sigma_m).all()):
+            return
+        covariance = np.diag(np.square([sigma_m[0], sigma_m[0], sigma_m[1]]))
+        carried = self._carried(state)
+        if carried is not None and self._anchor is not None:
+            if _sigma(carried[1]) <= _sigma(covariance):
+                return
+            apart = cov.mahalanobis_squared(position - carried[0], covariance + carried[1])
+            if self._anchor.from_fix and apart > _CONTRADICTION_SIGMAS**2:
+                return
+        self._anchor = _anchor(state, position, covariance, from_fix=False)
+
+
+def _anchor(state: VehicleState, position: FloatArray, covariance: FloatArray, from_fix: bool) -> _Anchor:
+    odometry = state.odometry_ned_m
+    usable = odometry is not None and bool(np.isfinite(odometry).all())
+    return _Anchor(state.stamp_ns, position, covariance, odometry if usable else None, state.odometry_epoch, from_fix)
 
 
 def _sigma(covariance: FloatArray) -> float:

@@ -1,7 +1,7 @@
 """Pose with an unknown focal length: the paper's two stages.
 
-Stage one takes f = max(W, H) and finds a pose by RANSAC; stage two refines focal length and pose together
-(aspect one, principal point in the middle, no distortion: appendix "Experiment Setting"). Over flat ground
+Stage one takes a guess, f = max(W, H) where there is no better, and finds a pose by RANSAC; stage two refines focal
+length and pose together (aspect and principal point fixed: appendix "Experiment Setting"). Over flat ground
 seen straight down focal length and height trade off without bound (appendix "Proof of Focal Length and
 Translation Ambiguity"): such an answer is refused rather than called a calibration.
 """
@@ -19,21 +19,15 @@ _FIRST_STAGE_FACTOR = 2.4
 MAX_RELATIVE_FOCAL_SIGMA = 0.05
 
 
-def solve(
-    points_local: FloatArray,
-    query_px: FloatArray,
-    width: int,
-    height: int,
-    *,
-    seed: int = 0,
-    initial_focal_px: float | None = None,
-) -> pnp.PoseEstimate | None:
+def solve(points_local: FloatArray, query_px: FloatArray, camera: Camera, *, seed: int = 0) -> pnp.PoseEstimate | None:
     """Pose and focal length of 2D-3D matches (N, 3) m, (N, 2) px.
 
+    Args:
+        camera: where to begin; its aspect and principal point stay. The paper begins with
+            ``Camera.from_focal(W, H, max(W, H))``.
     Returns: None where they are not determined. The caller judges ``focal_sigma_px`` against
-    :data:`MAX_RELATIVE_FOCAL_SIGMA`.
+        :data:`MAX_RELATIVE_FOCAL_SIGMA`.
     """
-    camera = Camera.from_focal(width, height, initial_focal_px or float(max(width, height)))
     strict_px = pnp.threshold_px(camera)
     loose_px = strict_px * _FIRST_STAGE_FACTOR
     start = pnp.solve(points_local, query_px, camera, max_error_px=loose_px, seed=seed)

@@ -67,7 +67,7 @@ def test_predicted_view_shows_a_dot_where_the_camera_would(tilt_deg, slopes):
     dop_px = np.round(GRID.px_from_map(middle + np.array([4.0, 7.0])))
     v, u = np.mgrid[: GRID.height, : GRID.width]
     dop = 255 * np.exp(-0.5 * ((u - dop_px[0]) ** 2 + (v - dop_px[1]) ** 2) / 3.0**2)
-    view = precondition.predicted_view(window, np.round(dop).astype(np.uint8), LOCAL, fitted, CAMERA, prior)
+    view = precondition.predicted_view(window, np.round(dop).astype(np.uint8), LOCAL, fitted, CAMERA, prior, True)
     xy = GRID.map_from_px(dop_px)
     point = np.array([*xy, plane[0] + (xy - (WEST, TOP)) @ plane[1:]])
     local_from_camera = LOCAL.local_from_map_pose(prior.map_from_camera)
@@ -87,7 +87,7 @@ def view_of(prior, plane=(0.0, 0.0, 0.0), camera=CAMERA):
     window = ramp_window(RasterGrid(600, 600, -300.0, 300.0, 1.0, -1.0), np.zeros(3))
     local = LocalFrame(0.0, 0.0, 1.0)
     dop = np.full((600, 600), 128, np.uint8)
-    return precondition.predicted_view(window, dop, local, GroundPlane(np.array(plane), 0.0), camera, prior)
+    return precondition.predicted_view(window, dop, local, GroundPlane(np.array(plane), 0.0), camera, prior, True)
 
 
 @given(finite(0, 60), finite(-180, 180), st.integers(0, 1000))
@@ -135,7 +135,7 @@ def test_nodata_of_the_orthophoto_is_not_valid():
     dop = np.full((600, 600), 9, np.uint8)
     prior = pose_prior(sigma_m=(0.1,) * 3, sigma_deg=(0.1,) * 3)
     local, plane = LocalFrame(0.0, 0.0, 1.0), GroundPlane(np.zeros(3), 0.0)
-    view = precondition.predicted_view(window, dop, local, plane, CAMERA, prior)
+    view = precondition.predicted_view(window, dop, local, plane, CAMERA, prior, True)
     # Heading north, west is on the left.
     assert not view.valid[:, :158].any()
     assert view.valid[:, 162:].all()
