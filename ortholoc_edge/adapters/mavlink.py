@@ -104,6 +104,8 @@ _GNSS_RANGE_ERROR_M = 3.0
 _JUMP_M = 2.0
 _JUMP_ACCELERATION_M_S2 = 10.0
 _LOCAL_GAP_NS = 2 * _S
+# Velocity is not integrated across a longer gap: at 10 m/s^2 it may hide 1.25 m already.
+_ODOMETRY_GAP_NS = 1 * _S
 _MAX_LOCAL_M = 1e6
 _MAX_SPEED_M_S = 500.0
 # Later than the newest sample by this much, time_boot_ms has gone back: the autopilot restarted.
@@ -211,9 +213,16 @@ class AutopilotState:
 
     Attributes:
         ned_from_body: (3, 3); None without an attitude within 0.2 s of the stamp.
+        interpolated: whether ``ned_from_body`` lies between two samples received; if not it was carried on by
+            the rates, and asking again a little later gives a better one.
         velocity_ned, local_position_ned_m: (3,) of LOCAL_POSITION_NED, relative to the EKF origin.
         local_epoch: rises when the local position jumped, its stream had a gap, the origin moved or the
             autopilot restarted. Positions of two epochs must not be subtracted.
+        odometry_ned_m: (3,) the integral of the autopilot's velocity since an arbitrary point; for
+            displacements. Not its position, because that takes in our own fixes: the way from one frame to
+            the next would hold the correction by the last fix once more. None without a sample near the stamp.
+        odometry_epoch: rises when the integral is broken: the velocity was missing for more than a second or
+            not finite, or the autopilot restarted.
         gnss: where GNSS is healthy: a fix, fresh, of stated and sufficient accuracy; None otherwise.
         origin: the EKF origin, once the autopilot has told it.
         armed: of the last HEARTBEAT. landed: of EXTENDED_SYS_STATE, None while unknown.
@@ -225,9 +234,12 @@ class AutopilotState:
 
     stamp_ns: int
     ned_from_body: FloatArray | None
+    interpolated: bool
     velocity_ned: FloatArray | None
     local_position_ned_m: FloatArray | None
     local_epoch: int
+    odometry_ned_m: FloatArray | None
+    odometry_epoch: int
     gnss: GnssPosition | None
     origin: GeodeticOrigin | None
     armed: bool
@@ -495,6 +507,18 @@ class _Local:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Odometry:
+    position: FloatArray
+    velocity: FloatArray
+    epoch: int
+
+    def after(self, seconds: float, acceleration: FloatArray | float = 0.0) -> FloatArray:
+        """(3,) position so much later (or earlier)."""
+        moved: FloatArray = self.position + self.velocity * seconds + 0.5 * acceleration * seconds**2
+        return moved
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Global:
     latitude_deg: float
     longitude_deg: float
@@ -602,7 +626,10 @@ class LinkProtocol:
         self._attitudes: TimeHistory[_Attitude] = TimeHistory(_HISTORY_NS, capacity)
         self._locals: TimeHistory[_Local] = TimeHistory(_HISTORY_NS, capacity)
         self._globals: TimeHistory[_Global] = TimeHistory(_HISTORY_NS, capacity)
+        self._odometry: TimeHistory[_Odometry] = TimeHistory(_HISTORY_NS, capacity)
         self._last_local: tuple[int, _Local] | None = None
+        self._last_odometry: tuple[int, _Odometry] | None = None
+        self._odometry_epoch = 0
         self._streams: dict[str, _Stream] = {}
         self._heartbeat_timer = _Repeat(1 * _S)
         self._version_timer = _Repeat(1 * _S, 10 * _S)
@@ -730,8 +757,9 @@ class LinkProtocol:
         self._log(now_ns, logging.WARNING, "restart", f"autopilot: {why}; asking for its streams again")
         self._epoch += 1
         self.timesync.reset()
-        for history in (self._attitudes, self._locals, self._globals):
+        for history in (self._attitudes, self._locals, self._globals, self._odometry):
             history.clear()
+        self._break_odometry()
         self._last_local = None
         self._newest_boot_ns = None
         self._ahead_in_a_row = 0
@@ -818,11 +846,14 @@ class LinkProtocol:
             or np.abs(values[3:]).max() > _MAX_SPEED_M_S
         ):
             self._garbage("LOCAL_POSITION_NED", arrival_ns, f"values {values.tolist()}")
+            if not (np.abs(values[3:]) <= _MAX_SPEED_M_S).all():
+                self._break_odometry()
             return
         boot_ns = self._boot_ns(m.time_boot_ms, arrival_ns)
         if boot_ns is None:
             return
         position, velocity = values[:3], values[3:]
+        self._add_velocity(boot_ns, arrival_ns, velocity)
         if self._last_local is not None and boot_ns > self._last_local[0]:
             last_ns, last = self._last_local
             dt = (boot_ns - last_ns) / _S
@@ -844,6 +875,26 @@ class LinkProtocol:
             self._last_local = (boot_ns, sample)
         else:
             self.counts["out_of_order"] += 1
+
+    def _break_odometry(self) -> None:
+        if self._last_odometry is not None:
+            self._last_odometry = None
+            self._odometry_epoch += 1
+
+    def _add_velocity(self, boot_ns: int, arrival_ns: int, velocity: FloatArray) -> None:
+        """Carry the odometry on, by trapezia."""
+        position = np.zeros(3)
+        if self._last_odometry is not None:
+            last_ns, last = self._last_odometry
+            if boot_ns <= last_ns:
+                return
+            if boot_ns - last_ns > _ODOMETRY_GAP_NS:
+                self._break_odometry()
+            else:
+                position = last.position + 0.5 * (last.velocity + velocity) * ((boot_ns - last_ns) / _S)
+        sample = _Odometry(position, velocity, self._odometry_epoch)
+        if self._odometry.add(boot_ns, arrival_ns, sample):
+            self._last_odometry = boot_ns, sample
 
     def _on_global_position(self, m: MavlinkMessage, arrival_ns: int) -> None:
         if not _is_position(m.lat, m.lon):
@@ -1029,13 +1080,18 @@ class LinkProtocol:
         best = self.timesync.best(stamp_ns) if self.timesync.synchronised else None
         by_boot = best is not None
         time_ns = stamp_ns + best[0] if best is not None else stamp_ns
+        attitude, interpolated = self._attitude_at(time_ns, by_boot)
         position, velocity, epoch = self._local_at(time_ns, by_boot)
+        odometry, odometry_epoch = self._odometry_at(time_ns, by_boot)
         return AutopilotState(
             stamp_ns=stamp_ns,
-            ned_from_body=self._attitude_at(time_ns, by_boot),
+            ned_from_body=attitude,
+            interpolated=interpolated,
             velocity_ned=velocity,
             local_position_ned_m=position,
             local_epoch=epoch,
+            odometry_ned_m=odometry,
+            odometry_epoch=odometry_epoch,
             gnss=self._gnss_at(stamp_ns, time_ns, by_boot),
             origin=self._origin,
             armed=self._armed,
@@ -1046,17 +1102,32 @@ class LinkProtocol:
             position_test_ratio=self._estimator[1] if self._estimator else None,
         )
 
-    def _attitude_at(self, time_ns: int, by_boot: bool) -> FloatArray | None:
+    def _attitude_at(self, time_ns: int, by_boot: bool) -> tuple[FloatArray | None, bool]:
         chosen = _choose(self._attitudes.around(time_ns, by_boot), time_ns, _MAX_EXTRAPOLATION_NS)
         if chosen is None:
-            return None
+            return None, False
         a, b, t = chosen
         first = rotation.from_quaternion(a.quaternion)
         if b is None:
             turned = first @ rotation.exp(np.array(a.rates_rad_s) * t)
         else:
             turned = rotation.slerp(first, rotation.from_quaternion(b.quaternion), t)
-        return frozen_floats(turned, (3, 3), "ned_from_body")
+        return frozen_floats(turned, (3, 3), "ned_from_body"), b is not None
+
+    def _odometry_at(self, time_ns: int, by_boot: bool) -> tuple[FloatArray | None, int]:
+        before, after = self._odometry.around(time_ns, by_boot)
+        if before is not None and after is not None and before[1].epoch == after[1].epoch:
+            # Of one epoch, so the gap is short. Velocity is linear in it, as the trapezium has it.
+            (t0, a), (t1, b) = before, after
+            acceleration = (b.velocity - a.velocity) / ((t1 - t0) / _S)
+            position, epoch = a.after((time_ns - t0) / _S, acceleration), a.epoch
+        else:
+            near = [sample for sample in (before, after) if sample is not None]
+            stamp, sample = min(near, key=lambda s: abs(time_ns - s[0]), default=(0, None))
+            if sample is None or abs(time_ns - stamp) > _MAX_EXTRAPOLATION_NS:
+                return None, self._odometry_epoch
+            position, epoch = sample.after((time_ns - stamp) / _S), sample.epoch
+        return frozen_floats(position, (3,), "odometry"), epoch
 
     def _local_at(self, time_ns: int, by_boot: bool) -> tuple[FloatArray | None, FloatArray | None, int]:
         chosen = _choose(

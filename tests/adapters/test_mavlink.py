@@ -345,6 +345,100 @@ def test_gap_in_local_position_ends_the_epoch():
     assert script.protocol.state_at(script.now).local_epoch == epoch + 1
 
 
+def odometry(script: Script, back_ms: float = 0.0):
+    state = script.protocol.state_at(script.now - round(back_ms * MS))
+    return state.odometry_ned_m, state.odometry_epoch
+
+
+@pytest.mark.parametrize("answered", [True, False])
+def test_odometry_is_the_integral_of_velocity_not_the_position(answered):
+    """10 m/s, a stop, 10 m/s again within 2.5 s: velocities of frames that far apart would say 25 m."""
+    script = Script()
+    flown = {}
+    north, t = 0.0, 0.0
+
+    def speed() -> float:
+        return 10.0 * min(1.0, abs(t - 5.25) / 1.25)
+
+    def move():
+        nonlocal north, t
+        before = speed()
+        t += 0.05
+        north += 0.05 * 0.5 * (before + speed())
+        flown[script.now] = north
+        # What it says of its position is pulled about by our own fixes.
+        script.local([north + 5.0 * (t % 1.0), 0.0, 0.0], [speed(), 0.0, -1.0])
+
+    script.run(8.0, step_ms=50, move=move, answer_timesync=answered)
+    lag_ms = 0 if answered else -5
+    a, epoch = odometry(script, 4000 + lag_ms)
+    b, same = odometry(script, 1500 + lag_ms)
+    assert epoch == same
+    truth = flown[script.now - 1500 * MS] - flown[script.now - 4000 * MS]
+    assert truth == pytest.approx(12.5, abs=0.05)
+    np.testing.assert_allclose(b - a, [truth, 0.0, -2.5], atol=0.02)
+    # Between two messages, and a little beyond the last.
+    c, d, e = (odometry(script, lag_ms + back_ms)[0] for back_ms in (20, 0, -150))
+    np.testing.assert_allclose(d - c, [0.2, 0.0, -0.02], atol=0.02)
+    np.testing.assert_allclose(e - d, [1.5, 0.0, -0.15], atol=0.02)
+    assert odometry(script, -300)[0] is None
+
+
+def test_odometry_goes_on_without_anybody_asking():
+    script = Script()
+    script.run(3.0, step_ms=50, move=lambda: script.local([0.0, 0.0, 0.0], [7.0, 0.0, 0.0]))
+    before, epoch = odometry(script)
+    script.run(8.0, step_ms=50, move=lambda: script.local([0.0, 0.0, 0.0], [7.0, 0.0, 0.0]))
+    after, same = odometry(script)
+    np.testing.assert_allclose(after - before, [56.0, 0.0, 0.0], atol=0.02)
+    assert same == epoch
+
+
+def test_broken_odometry_raises_its_epoch():
+    script = Script()
+
+    def fly(velocity: float = 5.0):
+        script.local([0.0, 0.0, 0.0], [velocity, 0.0, 0.0])
+
+    script.run(3.0, step_ms=50, move=fly)
+    before, epoch = odometry(script)
+    script.run(0.9)
+    fly()
+    after, same = odometry(script)
+    np.testing.assert_allclose(after - before, [4.5, 0.0, 0.0], atol=0.02)
+    assert same == epoch
+    # In the middle of a gap that short too.
+    np.testing.assert_allclose(odometry(script, 450)[0] - before, [2.25, 0.0, 0.0], atol=0.02)
+    script.run(1.1)
+    assert odometry(script)[0] is None
+    script.run(0.1, move=fly)
+    assert odometry(script)[1] == epoch + 1
+    for bad in (math.nan, math.inf, 1e6):
+        fly(bad)
+        fly(bad)
+        script.run(0.1, move=fly)
+        epoch = odometry(script)[1]
+    assert epoch == same + 4
+    script.offset_ns = -script.now + 2 * S
+    script.run(0.1, move=fly)
+    assert script.protocol.counts["restarts"] == 1
+    assert odometry(script)[1] == epoch + 1
+    script.hear(dialect.MAVLink_local_position_ned_message(script.boot_ms() - 30, 0, 0, 0, 400.0, 0.0, 0.0))
+    assert odometry(script)[1] == epoch + 1, "an old message must not break it"
+
+
+def test_bracketed_attitude_is_told_from_a_carried_on_one():
+    script = Script()
+    script.run(3.0, move=lambda: script.attitude(0.1))
+    assert script.protocol.state_at(script.now - 30 * MS).interpolated
+    ahead = script.protocol.state_at(script.now + 30 * MS)
+    assert ahead.ned_from_body is not None and not ahead.interpolated
+    stamp = script.now + 30 * MS
+    script.run(0.06, move=lambda: script.attitude(0.1))
+    assert script.protocol.state_at(stamp).interpolated
+    assert not script.protocol.state_at(script.now + 2 * S).interpolated
+
+
 def test_reboot_is_noticed_and_everything_asked_again():
     script = Script()
     script.run(3.0, move=lambda: (script.attitude(0.2), script.local([1.0, 2.0, 3.0])))
