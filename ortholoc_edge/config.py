@@ -22,6 +22,7 @@ from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
+from ortholoc_edge.pipeline.navigator import TimingOptions
 from ortholoc_edge.pipeline.tracker import TrackerOptions
 
 # The coarsest level of XFeat's network is at 1/32.
@@ -136,6 +137,7 @@ class Config(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     localizer: LocalizerOptions = field(default_factory=LocalizerOptions)
     tracker: TrackerOptions = field(default_factory=TrackerOptions)
     attitude: AttitudeOptions = field(default_factory=AttitudeOptions)
+    timing: TimingOptions = field(default_factory=TimingOptions)
     log: LogOptions = field(default_factory=LogOptions)
     bus: BusOptions = field(default_factory=BusOptions)
 

@@ -11,8 +11,10 @@ from __future__ import annotations
 import logging
 import math
 import threading
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -28,7 +30,14 @@ from ortholoc_edge.adapters.estimates import (
     earth_model,
     ned_from_geodetic,
 )
-from ortholoc_edge.adapters.mavlink import AutopilotLink, AutopilotState, Severity, SystemStatus
+from ortholoc_edge.adapters.mavlink import (
+    AutopilotLink,
+    AutopilotState,
+    GnssPosition,
+    Severity,
+    Statistic,
+    SystemStatus,
+)
 from ortholoc_edge.adapters.recorder import Recorder
 from ortholoc_edge.clock import Clock, SystemClock
 from ortholoc_edge.config import Config
@@ -42,7 +51,6 @@ from ortholoc_edge.matching.types import Matcher
 from ortholoc_edge.pipeline.frame import Frame, VehicleState
 from ortholoc_edge.pipeline.localizer import Localizer
 from ortholoc_edge.pipeline.navigator import Navigator
-from ortholoc_edge.pipeline.odometry import VelocityOdometry
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.tracker import Tracker, TrackerStatus
 from ortholoc_edge.pose import pnp
@@ -56,9 +64,13 @@ T = TypeVar("T")
 
 _WAIT_S = 0.2
 # The autopilot's attitude for an exposure arrives after it; the frame waits this long for it at most.
-_STATE_WAIT_S = 0.15
+_STATE_WAIT_NS = 150_000_000
 _MAX_ERRORS_IN_A_ROW = 5
-_STATUS_INTERVAL_NS = 5_000_000_000
+_STATUS_INTERVAL_NS = 1_000_000_000
+_FRESH_FIX_NS = 3_000_000_000
+# A read returns within `_WAIT_S`; a driver that holds it this long is not coming back by itself.
+_CAPTURE_HUNG_NS = 5_000_000_000
+_S = 1_000_000_000
 
 OutcomeListener = Callable[[Frame | None, Outcome], None]
 
@@ -119,79 +131,102 @@ class Daemon:
         self._config = config
         self._clock = clock or SystemClock()
         self._on_outcome = on_outcome
-        self._store = MapStore(
-            Pack.open(Path(config.map.pack)),
-            cache_bytes=config.map.cache_mb * 2**20,
-            tolerate_damage=config.map.tolerate_damage,
-        )
-        self._georeference = self._store.pack.georeference
-        _require_flyable(self._georeference, config.map.pack)
-        options = config.matcher
-        self._matcher = matcher or make_matcher(
-            options.name,
-            working_px=options.working_px,
-            max_keypoints=options.max_keypoints,
-            threads=options.threads,
-            model_path=None if options.model is None else Path(options.model),
-            model_sha256=options.model_sha256,
-        )
-        self._body_from_camera = config.mount.body_from_camera()
-        localizer = Localizer(config.intrinsics.camera(), self._store, self._matcher, config.localizer)
-        self._navigator = Navigator(localizer, Tracker(self._georeference, self._body_from_camera, config.tracker))
-        self._odometry = VelocityOdometry()
-        self._link = AutopilotLink(config.link, self._clock)
-        self._frames = frames or open_source(config.camera, self._clock)
-        self._recorder = Recorder(Path(config.log.folder), config.log.max_mb) if config.log.folder else None
-        self._bus = Bus(config.bus) if config.bus.enabled else None
+        with ExitStack() as resources:
+            # Closed in reverse, also where a later part can't be had.
+            self._store = resources.enter_context(
+                MapStore(
+                    Pack.open(Path(config.map.pack)),
+                    cache_bytes=config.map.cache_mb * 2**20,
+                    tolerate_damage=config.map.tolerate_damage,
+                )
+            )
+            self._georeference = self._store.pack.georeference
+            _require_flyable(self._georeference, config.map.pack)
+            options = config.matcher
+            self._matcher = matcher or make_matcher(
+                options.name,
+                working_px=options.working_px,
+                max_keypoints=options.max_keypoints,
+                threads=options.threads,
+                model_path=None if options.model is None else Path(options.model),
+                model_sha256=options.model_sha256,
+            )
+            self._body_from_camera = config.mount.body_from_camera()
+            localizer = Localizer(config.intrinsics.camera(), self._store, self._matcher, config.localizer)
+            resources.callback(localizer.close)
+            # In every life of the program another value, or the autopilot would not notice the restart.
+            first_reset_counter = self._clock.now_ns() // _S
+            tracker = Tracker(self._georeference, self._body_from_camera, config.tracker, first_reset_counter)
+            self._navigator = Navigator(localizer, tracker)
+            self._link = AutopilotLink(config.link, self._clock)
+            self._bus = resources.enter_context(closing(Bus(config.bus))) if config.bus.enabled else None
+            self._recorder = (
+                resources.enter_context(closing(Recorder(Path(config.log.folder), config.log.max_mb)))
+                if config.log.folder
+                else None
+            )
+            self._frames = resources.enter_context(closing(frames or open_source(config.camera, self._clock)))
+            self._resources = resources.pop_all()
         self._slot: LatestSlot[Frame | _Missed] = LatestSlot()
         self._ended = threading.Event()
         self._capture_failure: BaseException | None = None
-        self._counts = {"fixes": 0, "rejected": 0, "no_origin": 0}
+        self._capture_beat_ns = self._clock.now_ns()
+        self._last_fix_ns: int | None = None
+        self._counts: Counter[str] = Counter()
+        self._origin_missing = False
+        self._origin: GeodeticOrigin | None = None
         self._last_status_ns = 0
 
     @property
     def link(self) -> AutopilotLink:
         return self._link
 
-    def statistics(self) -> dict[str, int]:
-        """Counters since the start."""
-        return {**self._counts, "frames_replaced": self._slot.replaced}
+    def statistics(self) -> dict[str, Statistic]:
+        """Counters since the start: ours, the recorder's and the bus's drops, and the link's under ``link.``"""
+        return {
+            **self._counts,
+            "frames_replaced": self._slot.replaced,
+            "log_dropped": 0 if self._recorder is None else self._recorder.dropped,
+            "bus_dropped": 0 if self._bus is None else self._bus.dropped,
+            **{f"link.{name}": value for name, value in self._link.statistics().items()},
+        }
 
     def run(self, stop: threading.Event) -> None:
-        """Work until ``stop`` is set or the frames end.
+        """Work until ``stop`` is set or the frames end, then release everything; once only.
 
         Raises: OrtholocError where a part failed for good; systemd then starts afresh.
         """
-        self._warm_up()
-        capture = threading.Thread(target=self._capture, args=(stop,), name="capture", daemon=True)
-        self._link.set_system_status(SystemStatus.STANDBY)
-        self._link.start()
-        capture.start()
-        systemd.notify("READY=1")
-        logger.info("running: pack %s, matcher %s, solver %s", self._config.map.pack, self._matcher.name, pnp.SOLVER)
-        try:
+        with self._resources as resources:
+            self._warm_up()
+            self._link.set_system_status(SystemStatus.STANDBY)
+            resources.callback(lambda: logger.info("stopped: %s", self.statistics()))
+            resources.callback(self._link.stop)
+            self._link.start()
+            capture = threading.Thread(target=self._capture, args=(stop,), name="capture", daemon=True)
+            resources.callback(self._join_capture, capture, stop)
+            self._capture_beat_ns = self._clock.now_ns()
+            capture.start()
+            resources.callback(systemd.notify, "STOPPING=1")
+            systemd.notify("READY=1")
+            logger.info(
+                "running: pack %s, matcher %s, solver %s", self._config.map.pack, self._matcher.name, pnp.SOLVER
+            )
             self._work(stop)
-        finally:
-            systemd.notify("STOPPING=1")
-            stop.set()
-            self._frames.close()
-            capture.join(timeout=5.0)
-            self._link.stop()
-            if self._recorder is not None:
-                self._recorder.close()
-            if self._bus is not None:
-                self._bus.close()
-            self._navigator.localizer.close()
-            self._store.close()
-            logger.info("stopped: %s", self.statistics())
         if self._capture_failure is not None:
             raise CameraError(f"the camera thread ended: {self._capture_failure}") from self._capture_failure
+
+    def _join_capture(self, capture: threading.Thread, stop: threading.Event) -> None:
+        stop.set()
+        # Closing the source is what ends a read that waits for a device.
+        self._frames.close()
+        capture.join(timeout=5.0)
 
     # -- threads ---------------------------------------------------------------------------------------
 
     def _capture(self, stop: threading.Event) -> None:
         try:
             while not stop.is_set():
+                self._capture_beat_ns = self._clock.now_ns()
                 try:
                     frame = self._frames.read(_WAIT_S)
                 except BadFrameError as bad:
@@ -211,14 +246,19 @@ class Daemon:
     def _work(self, stop: threading.Event) -> None:
         errors = 0
         while not stop.is_set():
-            systemd.notify("WATCHDOG=1")
+            self._feed_watchdog()
             if self._link.failure is not None:
                 raise LinkError(f"the link's thread ended: {self._link.failure}") from self._link.failure
+            # Before the slot is looked at: what came before the end must still be taken.
+            ended = self._ended.is_set()
             item = self._slot.take(_WAIT_S)
             self._report_status()
             if item is None:
-                if self._ended.is_set():
+                if ended:
                     return
+                continue
+            if isinstance(item, _Missed):
+                self._publish(None, Rejected(item.stamp_ns, Reason.BAD_FRAME, item.why))
                 continue
             try:
                 self._handle(item, stop)
@@ -226,9 +266,14 @@ class Daemon:
             except Exception as error:  # one spot per thread, around one item (house style)
                 errors += 1
                 logger.exception("frame at %d ns", item.stamp_ns)
-                self._publish(None, Rejected(item.stamp_ns, Reason.INTERNAL, repr(error)))
+                self._publish(item, Rejected(item.stamp_ns, Reason.INTERNAL, repr(error)))
                 if errors >= _MAX_ERRORS_IN_A_ROW:
                     raise OrtholocError(f"{errors} frames in a row failed, last with {error!r}") from error
+
+    def _feed_watchdog(self) -> None:
+        """Only while the capture thread comes back from its reads: a hung camera is no progress."""
+        if self._ended.is_set() or self._clock.now_ns() - self._capture_beat_ns <= _CAPTURE_HUNG_NS:
+            systemd.notify("WATCHDOG=1")
 
     def _warm_up(self) -> None:
         """The first inference allocates and compiles; it must not happen in flight."""
@@ -237,64 +282,89 @@ class Daemon:
 
     # -- one frame -------------------------------------------------------------------------------------
 
-    def _handle(self, item: Frame | _Missed, stop: threading.Event) -> None:
-        if isinstance(item, _Missed):
-            self._publish(None, Rejected(item.stamp_ns, Reason.BAD_FRAME, item.why))
-            return
-        known = self._state_at(item.stamp_ns, stop)
-        state = self._vehicle_state(item.stamp_ns, known)
-        outcome = self._navigator.step(item, state)
+    def _handle(self, frame: Frame, stop: threading.Event) -> None:
+        known = self._state_at(frame.stamp_ns, stop)
+        state = self._vehicle_state(frame.stamp_ns, known)
+
+        def proceed() -> bool:
+            self._feed_watchdog()
+            return self._age_ms(frame.stamp_ns) < self._config.timing.max_age_ms and not stop.is_set()
+
+        outcome = self._navigator.step(frame, state, proceed)
         if isinstance(outcome, Fix):
+            self._last_fix_ns = frame.stamp_ns
+            age_ms, limit_ms = self._age_ms(frame.stamp_ns), self._config.timing.max_age_ms
+            if age_ms > limit_ms:
+                # Good for the next prediction, but an autopilot would take it for newer than it is.
+                late = Rejected(frame.stamp_ns, Reason.LATE, "a fix, but too old to send, ms", age_ms, limit_ms)
+                self._publish(frame, replace(late, timings_ms=outcome.timings_ms))
+                return
             self._send(outcome, known)
-        self._publish(item, outcome)
+        self._publish(frame, outcome)
+
+    def _age_ms(self, stamp_ns: int) -> float:
+        return (self._clock.now_ns() - stamp_ns) / 1e6
 
     def _state_at(self, stamp_ns: int, stop: threading.Event) -> AutopilotState | None:
         """The autopilot's state at an exposure, waiting a little for the telemetry that follows it."""
-        deadline_ns = self._clock.now_ns() + round(_STATE_WAIT_S * 1e9)
+        deadline_ns = self._clock.now_ns() + _STATE_WAIT_NS
         while True:
             known = self._link.state_at(stamp_ns)
-            if known is not None and known.ned_from_body is not None:
+            if known is not None and known.interpolated:
                 return known
-            if self._clock.now_ns() >= deadline_ns or stop.wait(0.01):
+            if self._clock.now_ns() >= deadline_ns or stop.wait(0.005):
                 return known
 
     def _vehicle_state(self, stamp_ns: int, known: AutopilotState | None) -> VehicleState:
         roll, pitch, yaw = (math.radians(sigma) for sigma in self._config.attitude.sigma_deg)
         if known is None:
             return VehicleState(stamp_ns, None, (roll, pitch, yaw))
-        has_odometry = self._odometry.add(stamp_ns, known.velocity_ned)
-        position = sigma_m = None
-        if known.gnss is not None:
-            gnss = known.gnss
-            position = self._georeference.map_from_geodetic(
-                gnss.latitude_deg, gnss.longitude_deg, height_amsl_m=gnss.height_amsl_m
-            )
-            sigma_m = gnss.sigma_horizontal_m, gnss.sigma_vertical_m
+        position = None if known.gnss is None else self._map_position(known.gnss)
         return VehicleState(
             stamp_ns,
             known.ned_from_body,
             (roll, pitch, yaw),
-            self._odometry.position_ned_m if has_odometry else None,
-            self._odometry.epoch,
+            known.odometry_ned_m,
+            known.odometry_epoch,
             position,
-            sigma_m or (0.0, 0.0),
+            (0.0, 0.0) if known.gnss is None else (known.gnss.sigma_horizontal_m, known.gnss.sigma_vertical_m),
         )
 
+    def _map_position(self, gnss: GnssPosition) -> FloatArray | None:
+        """None for a place that the pack's projection can't take, a spoofed one on another continent, say."""
+        try:
+            return self._georeference.map_from_geodetic(
+                gnss.latitude_deg, gnss.longitude_deg, height_amsl_m=gnss.height_amsl_m
+            )
+        except MapError as error:
+            if not self._counts["gnss_unusable"]:
+                logger.warning("the autopilot's GNSS position can't be used: %s", error)
+            self._counts["gnss_unusable"] += 1
+            return None
+
     def _send(self, fix: Fix, known: AutopilotState | None) -> None:
-        vehicle = self._link.vehicle
-        if known is None or vehicle is None:
+        vehicle, now = self._link.vehicle, self._link.state_at(fix.stamp_ns)
+        if known is None or now is None or vehicle is None:
+            self._counts["no_autopilot"] += 1
             return
         map_from_body = fix.map_from_camera @ self._body_from_camera.inverse()
-        if known.origin is None:
+        if now.origin is None:
             self._counts["no_origin"] += 1
+            self._origin_missing = True
             self._offer_origin(map_from_body.translation)
             return
+        if self._origin is not None and now.origin != self._origin:
+            # What was sent before meant other places; without notice the filter would take this for a jump.
+            logger.warning("the autopilot's origin moved")
+            self._navigator.tracker.announce_jump()
+        self._origin = now.origin
+        self._counts["sent"] += 1
         self._link.send_estimate(
             vision_estimate(
                 fix,
                 map_from_body,
                 self._georeference,
-                known.origin,
+                now.origin,
                 earth_model(vehicle.autopilot),
                 self._navigator.tracker.reset_counter,
             )
@@ -319,13 +389,16 @@ class Daemon:
         if now_ns - self._last_status_ns < _STATUS_INTERVAL_NS:
             return
         self._last_status_ns = now_ns
-        status = self._navigator.tracker.status
-        tracking = status is TrackerStatus.TRACK
-        self._link.set_system_status(SystemStatus.ACTIVE if tracking else SystemStatus.STANDBY)
+        # By the age of the last fix, not by what the last frame came to: a camera that hangs gives no frame.
+        fresh = self._last_fix_ns is not None and now_ns - self._last_fix_ns < _FRESH_FIX_NS
+        status = TrackerStatus.TRACK if fresh else self._navigator.tracker.status
+        if not fresh and status is TrackerStatus.TRACK:
+            status = TrackerStatus.COAST
+        self._link.set_system_status(SystemStatus.ACTIVE if fresh else SystemStatus.STANDBY)
         systemd.notify(f"STATUS={status}, {self._counts['fixes']} fixes, {self._counts['rejected']} rejected")
-        if self._counts["no_origin"] and self._link.connected():
+        if self._origin_missing and self._link.connected():
             self._link.send_status_text(Severity.WARNING, "OrthoLoC: EKF origin unknown, fixes not sent")
-            self._counts["no_origin"] = 0
+            self._origin_missing = False
 
 
 def vision_estimate(

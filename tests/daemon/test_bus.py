@@ -14,7 +14,7 @@ import pytest
 import zenoh
 
 from ortholoc_edge.adapters.bus import Bus, BusOptions
-from ortholoc_edge.errors import ConfigError
+from ortholoc_edge.errors import ConfigError, LinkError
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.outcome import Fix, Reason, Rejected
@@ -116,7 +116,7 @@ def test_publishing_after_the_session_ended_does_not_raise(bus: Bus) -> None:
 
 
 def test_endpoint_that_is_taken_is_named(bus: Bus, endpoint: str) -> None:
-    with pytest.raises(ConfigError, match=r"127\.0\.0\.1.*\[bus\]"):
+    with pytest.raises(LinkError, match=r"127\.0\.0\.1.*\[bus\]"):
         Bus(BusOptions(enabled=True, listen=(endpoint,)))
 
 
