@@ -22,7 +22,7 @@ import pyproj
 import rasterio
 import rasterio.shutil
 from pyproj.exceptions import CRSError
-from rasterio.enums import ColorInterp
+from rasterio.enums import ColorInterp, Resampling
 from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
@@ -76,6 +76,9 @@ _CHUNK_PX = 2048
 _BUILD_CACHE_BYTES = 256 * 2**20
 
 _SPARSE_COVERAGE = 0.5
+
+# Of the full-resolution cells below a cell of an overview, what must have data for it to have any.
+_MIN_VALID_SHARE = 0.75
 
 
 @dataclass(frozen=True, slots=True)
@@ -384,17 +387,22 @@ def _write(
     say: Progress,
 ) -> Manifest:
     max_z_error_m = options.max_z_error_m or min(_MAX_Z_ERROR_M, round(dsm.grid.gsd_m * _MAX_Z_ERROR_PER_GSD, 6))
-    work = staged / "work.tif"
+    folder = staged / "work"
+    folder.mkdir()
+    work, valid_work = folder / "work.tif", folder / "valid.tif"
 
     valid = _normalise_dop(dop, work, lambda done: say(0.3 * done, "reading the orthophoto"))
     say(0.3, "compressing the orthophoto")
     _to_cog(work, staged / _DOP_NAME, compress=options.dop_compression.upper(), quality=options.quality)
     dop_written = _described(staged / _DOP_NAME, valid)
 
-    valid = _normalise_dsm(dsm, work, lambda done: say(0.6 + 0.15 * done, "reading the surface model"))
+    work.unlink()
+    valid = _normalise_dsm(dsm, work, valid_work, lambda done: say(0.6 + 0.15 * done, "reading the surface model"))
     say(0.75, "compressing the surface model")
-    _to_cog(work, staged / _DSM_NAME, compress="LERC_ZSTD", max_z_error=max_z_error_m)
+    levelled = _with_surface_levels(work, valid_work)
+    _to_cog(levelled, staged / _DSM_NAME, compress="LERC_ZSTD", max_z_error=max_z_error_m, overviews="AUTO")
     dsm_written = _described(staged / _DSM_NAME, valid)
+    shutil.rmtree(folder)
 
     return Manifest(
         format=FORMAT,
@@ -476,13 +484,17 @@ def _normalise_dop(source: _Source, work: Path, done: Callable[[float], None]) -
     return valid_px / (source.grid.width * source.grid.height)
 
 
-def _normalise_dsm(source: _Source, work: Path, done: Callable[[float], None]) -> float:
-    """Copy to float32 heights with one nodata value. Returns: the share of valid cells."""
+def _normalise_dsm(source: _Source, work: Path, valid_work: Path, done: Callable[[float], None]) -> float:
+    """Copy to float32 heights with one nodata value, and validity (0 or 1) to a raster of its own.
+
+    Returns: the share of valid cells.
+    """
     dataset = source.dataset
     scale, offset = dataset.scales[0], dataset.offsets[0]
     profile = _work_profile(source, count=1, dtype="float32", nodata=NODATA, predictor=3)
     valid_px, undeclared = 0, set()
-    with rasterio.open(work, "w", **profile) as target:
+    valid_profile = _work_profile(source, count=1, dtype="float32")
+    with rasterio.open(work, "w", **profile) as target, rasterio.open(valid_work, "w", **valid_profile) as share:
         for window in _chunks(source.grid, done):
             raw = _read(source, 1, window).astype(np.float64)
             valid = _mask(source, window) & np.isfinite(raw)
@@ -494,6 +506,7 @@ def _normalise_dsm(source: _Source, work: Path, done: Callable[[float], None]) -
             heights = raw * scale + offset
             _check_heights(heights[valid], source.path)
             target.write(np.where(valid, heights, NODATA).astype(np.float32), 1, window=window)
+            share.write(valid.astype(np.float32), 1, window=window)
             valid_px += int(np.count_nonzero(valid))
     if valid_px == 0:
         raise MapError(f"{source.path}: no valid height; check its nodata value with gdalinfo")
@@ -538,10 +551,16 @@ def _alpha_band(dataset: Any) -> int | None:
 
 
 def _chunks(grid: RasterGrid, done: Callable[[float], None]) -> Iterator[Window]:
-    for row in range(0, grid.height, _CHUNK_PX):
-        for column in range(0, grid.width, _CHUNK_PX):
-            yield Window(column, row, min(_CHUNK_PX, grid.width - column), min(_CHUNK_PX, grid.height - row))
-        done(min((row + _CHUNK_PX) / grid.height, 1.0))
+    for window in _windows(grid.width, grid.height):
+        yield window
+        if window.col_off + window.width == grid.width:
+            done((window.row_off + window.height) / grid.height)
+
+
+def _windows(width: int, height: int) -> Iterator[Window]:
+    for row in range(0, height, _CHUNK_PX):
+        for column in range(0, width, _CHUNK_PX):
+            yield Window(column, row, min(_CHUNK_PX, width - column), min(_CHUNK_PX, height - row))
 
 
 def _work_profile(source: _Source, **more: Any) -> dict[str, Any]:
@@ -573,17 +592,58 @@ def _rasterio_crs(source: _Source) -> Any:
         raise MapError(f"{source.path}: {crs.name} is not known to GDAL ({err}); reproject to UTM") from err
 
 
-def _to_cog(work: Path, out: Path, **compression: Any) -> None:
-    """AVERAGE leaves out masked pixels and nodata cells, so that neither bleeds into an overview."""
+def _with_surface_levels(work: Path, valid_work: Path) -> Path:
+    """Overviews in which a cell has data only where 3 in 4 of the cells below it have.
+
+    GDAL's AVERAGE leaves out nodata, so that one valid cell of four makes a valid average, one of sixteen two
+    levels up: every scattered hole would be closed with the heights around it.
+    Returns: a VRT of ``work`` with these levels, beside it.
+    """
+    with rasterio.open(work) as full:
+        profile, size = full.profile, max(full.width, full.height)
+    factors: list[int] = []
+    while size > BLOCK_PX:  # as the COG driver does
+        factors.append(2 << len(factors))
+        size = -(-size // 2)
+    vrt = work.with_suffix(".vrt")
+    rasterio.shutil.copy(work, vrt, driver="VRT")
+    if not factors:
+        return vrt
+    for path in (work, valid_work):
+        with rasterio.open(path, "r+") as dataset:
+            dataset.build_overviews(factors, Resampling.average)
+    entries = ""
+    for level in range(len(factors)):
+        name = f"level{level + 1}.tif"
+        with (
+            rasterio.open(work, overview_level=level) as averaged,
+            rasterio.open(valid_work, overview_level=level) as share,
+        ):
+            profile.update(width=averaged.width, height=averaged.height, transform=averaged.transform)
+            with rasterio.open(work.with_name(name), "w", **profile) as target:
+                for window in _windows(averaged.width, averaged.height):
+                    heights = averaged.read(1, window=window)
+                    # Rounding of GDAL's weights must not decide over exactly 3 of 4.
+                    heights[share.read(1, window=window) < _MIN_VALID_SHARE - 1e-4] = NODATA
+                    target.write(heights, 1, window=window)
+        entries += (
+            f'<Overview><SourceFilename relativeToVRT="1">{name}</SourceFilename>'
+            "<SourceBand>1</SourceBand></Overview>"
+        )
+    vrt.write_text(vrt.read_text().replace("</VRTRasterBand>", entries + "</VRTRasterBand>"))
+    return vrt
+
+
+def _to_cog(work: Path, out: Path, *, overviews: str = "IGNORE_EXISTING", **compression: Any) -> None:
+    """AVERAGE leaves out masked pixels, so that their colour does not bleed into an overview."""
     rasterio.shutil.copy(
         work,
         out,
         driver="COG",
         blocksize=BLOCK_PX,
-        overviews="IGNORE_EXISTING",
+        overviews=overviews,
         overview_resampling="AVERAGE",
         bigtiff="IF_SAFER",
         num_threads="ALL_CPUS",
         **compression,
     )
-    work.unlink()

@@ -18,6 +18,7 @@ from tile_rasters import (
     colours,
     dop_pixels,
     dsm_heights,
+    plane,
     write_holed_scene,
     write_raster,
     write_scene,
@@ -81,6 +82,33 @@ def test_pack_is_two_cogs_that_rasterio_opens(holed_pack):
             first = int(dataset.get_tag_item("BLOCK_OFFSET_0_0", "TIFF", bidx=1, ovr=levels - 2))
             last = int(dataset.get_tag_item("BLOCK_OFFSET_0_0", "TIFF", bidx=1))
             assert first < last  # the coarsest level comes first
+
+
+def test_overviews_keep_the_holes_of_the_surface(scene, tmp_path):
+    """An overview cell has data exactly where 3 in 4 of the full cells below it have."""
+    grid = RasterGrid(2048, 1536, DSM_GRID.west, DSM_GRID.top, 0.072, -0.072)
+    heights = dsm_heights(grid)[0]
+    rng = np.random.default_rng(1)
+    invalid = np.zeros(heights.shape, dtype=bool)
+    invalid[:, :1024] = rng.random((1536, 1024)) < 0.3
+    for row, column, side in ((100, 1300, 2), (300, 1501, 5), (701, 1403, 64), (900, 1700, 150)):
+        invalid[row : row + side, column : column + side] = True
+    dsm = write_raster(tmp_path / "dsm.tif", np.where(invalid, np.nan, heights)[None], grid, nodata=float("nan"))
+    pack = build_pack(scene[0], dsm, tmp_path / "pack")
+    assert sorted(path.name for path in pack.path.iterdir()) == ["dop.tif", "dsm.tif", "manifest.json"]
+    assert np.array_equal(dsm_of(pack) == -9999.0, invalid)
+    with MapStore(pack) as store:
+        assert [one.width for one in store.dsm_grids] == [2048, 1024, 512]
+        for factor, level in ((2, store.dsm_grids[1]), (4, store.dsm_grids[2])):
+            window = store.read(store.bounds, 0.1, level.gsd_m)
+            below = (window.dsm_grid.height, factor, window.dsm_grid.width, factor)
+            covered = invalid[: below[0] * factor, : below[2] * factor].reshape(below)
+            share = 1.0 - covered.mean(axis=(1, 3))
+            assert np.array_equal(np.isnan(window.dsm), share < 0.75)
+            # Scattered holes leave fewer cells than at full resolution, not more.
+            assert np.isnan(window.dsm[:, : 1000 // factor]).mean() > 0.3
+            error = np.abs(window.dsm - plane(centres(window.dsm_grid)))[share >= 0.75]
+            assert error.max() < 0.5 * level.gsd_m
 
 
 def test_manifest_tells_what_was_stated(scene, tmp_path):
