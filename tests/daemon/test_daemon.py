@@ -28,14 +28,16 @@ from ortholoc_sim.site import Site
 from replay import rendered
 
 from ortholoc_edge.adapters import systemd
-from ortholoc_edge.adapters.camera import CameraOptions
+from ortholoc_edge.adapters.camera import CameraOptions, EndOfFrames
 from ortholoc_edge.adapters.mavlink import LinkOptions
 from ortholoc_edge.config import Config, Intrinsics, LogOptions, MapOptions, MatcherOptions
 from ortholoc_edge.daemon import Daemon, LatestSlot
-from ortholoc_edge.errors import OrtholocError
+from ortholoc_edge.errors import MapError, OrtholocError
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.pipeline.frame import Frame
+from ortholoc_edge.pipeline.navigator import TimingOptions
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
+from ortholoc_edge.tiles.georeference import Georeference
 
 ROLL, PITCH, YAW = 3.0, -4.0, 30.0
 TRUTH = rendered.pose(roll_deg=ROLL, pitch_deg=PITCH, yaw_deg=YAW)
@@ -91,6 +93,8 @@ class HoveringAutopilot(FakeAutopilot):
 
 def config(source: str, endpoint: str, **more: Any) -> Config:
     camera = rendered.CAMERA
+    # A busy test machine is not what is tested here.
+    more.setdefault("timing", TimingOptions(max_age_ms=20_000.0))
     return Config(
         camera=CameraOptions(source=source, rate_hz=4.0),
         intrinsics=Intrinsics(
@@ -265,6 +269,99 @@ def test_origin_is_offered_where_that_is_allowed(folder: Path) -> None:
     assert offered.altitude == pytest.approx(PLACE.height_amsl_m * 1e3, abs=3000)
     first = autopilot.messages("ODOMETRY")[0]
     assert np.linalg.norm([first.x, first.y, first.z]) < 3.0
+
+
+def test_a_fix_that_is_too_old_is_not_sent(folder: Path) -> None:
+    wire = UdpWire()
+    autopilot = HoveringAutopilot(wire)
+    outcomes: list[Outcome] = []
+    options = config(f"folder:{folder}", f"udpout:127.0.0.1:{wire.port}", timing=TimingOptions(max_age_ms=1.0))
+    daemon = Daemon(options, on_outcome=lambda _, outcome: outcomes.append(outcome))
+    try:
+        with running(daemon):
+            late = wait_for(
+                lambda: [o for o in list(outcomes) if isinstance(o, Rejected) and o.reason is Reason.LATE], "a late fix"
+            )
+    finally:
+        autopilot.close()
+    assert late[0].measured is not None
+    assert late[0].measured > 1.0
+    assert autopilot.messages("ODOMETRY") == []
+    assert not any(isinstance(outcome, Fix) for outcome in outcomes)
+
+
+def test_gnss_on_another_continent_is_survived(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A spoofed or cold receiver may claim what the pack's projection can't take."""
+    wire = UdpWire()
+    autopilot = HoveringAutopilot(wire)
+    outcomes: list[Outcome] = []
+    daemon = Daemon(
+        config(f"folder:{folder}", f"udpout:127.0.0.1:{wire.port}"),
+        on_outcome=lambda _, outcome: outcomes.append(outcome),
+    )
+
+    def off_the_earth(*_: Any, **__: Any) -> Any:
+        raise MapError("outside of the projection's domain")
+
+    try:
+        with running(daemon):
+            wait_for(lambda: autopilot.messages("ODOMETRY"), "an estimate")
+            monkeypatch.setattr(Georeference, "map_from_geodetic", off_the_earth)
+            seen = len(outcomes)
+            wait_for(lambda: len(outcomes) >= seen + 7 or None, "seven more frames")
+            assert any(isinstance(o, Fix) for o in outcomes[seen:]), "the chain of fixes must go on without GNSS"
+            assert daemon.statistics()["gnss_unusable"]
+    finally:
+        autopilot.close()
+
+
+def test_a_moved_origin_raises_the_reset_counter(folder: Path) -> None:
+    wire = UdpWire()
+    autopilot = HoveringAutopilot(wire)
+    daemon = Daemon(config(f"folder:{folder}", f"udpout:127.0.0.1:{wire.port}"))
+    try:
+        with running(daemon):
+            before = wait_for(lambda: autopilot.messages("ODOMETRY"), "an estimate")[-1]
+            assert autopilot.origin is not None
+            autopilot.origin = (autopilot.origin[0] + 10_000, *autopilot.origin[1:])
+            after = wait_for(
+                lambda: [m for m in autopilot.messages("ODOMETRY") if abs(m.x - before.x) > 50.0],
+                "an estimate from the new origin",
+            )[0]
+    finally:
+        autopilot.close()
+    # A thousandth of a degree to the north.
+    assert before.x - after.x == pytest.approx(111.2, abs=3.0)
+    assert after.reset_counter == (before.reset_counter + 1) % 256
+
+
+def test_watchdog_starves_when_the_camera_hangs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(systemd, "notify", said.append)
+    monkeypatch.setattr("ortholoc_edge.daemon._CAPTURE_HUNG_NS", 300_000_000)
+    wire = UdpWire()
+    autopilot = HoveringAutopilot(wire)
+    hung = threading.Event()
+
+    class HangingCamera:
+        def read(self, timeout_s: float) -> Frame | None:
+            hung.wait(20.0)
+            raise EndOfFrames
+
+        def close(self) -> None:
+            hung.set()
+
+    daemon = Daemon(config(f"folder:{folder}", f"udpout:127.0.0.1:{wire.port}"), frames=HangingCamera())
+    try:
+        with running(daemon):
+            wait_for(lambda: "WATCHDOG=1" in said or None, "the watchdog")
+            wait_for(lambda: any(line.startswith("STATUS=search") for line in said), "a status")
+            time.sleep(0.5)
+            fed = said.count("WATCHDOG=1")
+            time.sleep(0.7)
+            assert said.count("WATCHDOG=1") == fed
+    finally:
+        autopilot.close()
 
 
 def test_end_of_the_frames_ends_the_daemon(tmp_path: Path) -> None:

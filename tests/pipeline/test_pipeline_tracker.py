@@ -276,3 +276,39 @@ def test_a_rejection_before_any_fix_stays_a_search():
     made.predict(now)
     made.update(Rejected(0, Reason.FEW_MATCHES), now)
     assert made.status is TrackerStatus.SEARCH
+
+
+def test_the_last_gnss_position_is_carried_on_when_gnss_ends_before_the_first_fix():
+    made = tracker()
+    for second in range(5):
+        prior = made.predict(state(second, (10.0 * second, 0, 0), position=(0, 10.0 * second, 100)))
+        made.update(Rejected(second, Reason.FEW_MATCHES), state(second))
+        assert isinstance(prior, PosePrior)
+    prior = made.predict(state(6, (60.0, 0, 0)))
+    assert isinstance(prior, PosePrior)
+    # North 20 m since the last GNSS position at (0, 40).
+    assert np.allclose(prior.map_from_camera.translation, (0, 60, 100), atol=1e-6)
+    assert made.status is TrackerStatus.SEARCH
+
+
+def test_a_spoofed_gnss_does_not_steer_away_from_the_fixes():
+    made = fixed()
+    prior = made.predict(state(3, (0, 0, 0), position=(60.0, 0, 100), sigma=(0.05, 0.05)))
+    assert np.allclose(prior.map_from_camera.translation, (0, 0, 100))
+    # Nor once it has been heard for a while.
+    for second in range(4, 10):
+        prior = made.predict(state(second, (0, 0, 0), position=(60.0, 0, 100), sigma=(0.05, 0.05)))
+    assert np.allclose(prior.map_from_camera.translation, (0, 0, 100))
+
+
+def test_gnss_comes_back_when_the_chain_has_grown_unsure():
+    made = fixed(odometry_drift_m_per_s=1.0)
+    prior = made.predict(state(40, (0, 0, 0), position=(60.0, 0, 100), sigma=(1.5, 2.5)))
+    assert np.allclose(prior.map_from_camera.translation, (60, 0, 100))
+
+
+def test_another_life_begins_with_another_reset_counter():
+    made = Tracker(LOCAL, NADIR, TrackerOptions(), first_reset_counter=1000)
+    assert made.reset_counter == 1000 % 256
+    made.announce_jump()
+    assert made.reset_counter == 1000 % 256 + 1
