@@ -48,6 +48,7 @@ from ortholoc_edge.adapters.estimates import (
     covariance_layout,
     encode_odometry,
     encode_vision_position_estimate,
+    moved,
 )
 from ortholoc_edge.clock import Clock
 from ortholoc_edge.errors import ConfigError, LinkError
@@ -93,11 +94,13 @@ _HISTORY_NS = 10 * _S
 _MAX_EXTRAPOLATION_NS = 200 * _MS
 # Samples farther apart than this are not interpolated between: the shortest turn need not be the true one.
 _MAX_GAP_NS = 500 * _MS
-# GLOBAL_POSITION_INT comes at 5 Hz with a velocity.
-_MAX_GLOBAL_EXTRAPOLATION_NS = 500 * _MS
 _GNSS_FRESH_NS = 1500 * _MS
 _GNSS_MAX_HDOP = 4.0
 _GNSS_MAX_SIGMA_M = 25.0
+# A receiver's h_acc and v_acc are of its noise. What they leave out does not average away: ETRS89, which maps are
+# in, against the WGS 84 of GNSS is 0.8 to 1.5 m (docs/frames.md), a receiver's bias in the open is
+# of the order of a metre, its time of arrival is 0.1 to 0.2 s late, and its geoid model differs from the map's.
+_GNSS_LEAST_SIGMA_M, _GNSS_LEAST_SIGMA_VERTICAL_M = 1.5, 2.5
 # 1-sigma per unit of dilution for a single-frequency receiver, where it gives no accuracy in metres.
 _GNSS_RANGE_ERROR_M = 3.0
 # Local position: a step beyond constant velocity that no vehicle flies is a reset of the filter.
@@ -198,7 +201,8 @@ class AutopilotIdentity:
 
 @dataclass(frozen=True, slots=True)
 class GnssPosition:
-    """A GNSS-backed position. Sigmas are 1-sigma, the horizontal one per axis."""
+    """What the GNSS receiver itself measured, carried to the stamp by odometry; 1-sigma, the horizontal one per
+    axis. Not the autopilot's own position: that one holds our fixes too, and would confirm their errors."""
 
     latitude_deg: float
     longitude_deg: float
@@ -514,21 +518,18 @@ class _Odometry:
 
     def after(self, seconds: float, acceleration: FloatArray | float = 0.0) -> FloatArray:
         """(3,) position so much later (or earlier)."""
-        moved: FloatArray = self.position + self.velocity * seconds + 0.5 * acceleration * seconds**2
-        return moved
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Global:
-    latitude_deg: float
-    longitude_deg: float
-    height_amsl_m: float
+        there: FloatArray = self.position + self.velocity * seconds + 0.5 * acceleration * seconds**2
+        return there
 
 
 @dataclass(frozen=True, slots=True)
 class _GpsRaw:
     arrival_ns: int
+    boot_ns: int | None  # of the fix, by the autopilot's clock
     fix_type: int
+    latitude_deg: float
+    longitude_deg: float
+    height_amsl_m: float
     sigma_horizontal_m: float | None
     sigma_vertical_m: float | None
 
@@ -625,7 +626,6 @@ class LinkProtocol:
         capacity = 2 * int(_HISTORY_NS / _S * max(20.0, options.attitude_rate_hz, options.position_rate_hz))
         self._attitudes: TimeHistory[_Attitude] = TimeHistory(_HISTORY_NS, capacity)
         self._locals: TimeHistory[_Local] = TimeHistory(_HISTORY_NS, capacity)
-        self._globals: TimeHistory[_Global] = TimeHistory(_HISTORY_NS, capacity)
         self._odometry: TimeHistory[_Odometry] = TimeHistory(_HISTORY_NS, capacity)
         self._last_local: tuple[int, _Local] | None = None
         self._last_odometry: tuple[int, _Odometry] | None = None
@@ -641,7 +641,6 @@ class LinkProtocol:
             "ATTITUDE_QUATERNION": self._on_attitude_quaternion,
             "ATTITUDE": self._on_attitude,
             "LOCAL_POSITION_NED": self._on_local_position,
-            "GLOBAL_POSITION_INT": self._on_global_position,
             "GPS_RAW_INT": self._on_gps_raw,
             "GPS_GLOBAL_ORIGIN": self._on_origin,
             "HOME_POSITION": self._on_home,
@@ -740,7 +739,6 @@ class LinkProtocol:
         rates = {
             "ATTITUDE_QUATERNION": self._options.attitude_rate_hz,
             "LOCAL_POSITION_NED": self._options.position_rate_hz,
-            "GLOBAL_POSITION_INT": 5.0,
             "GPS_RAW_INT": 2.0,
             "SYSTEM_TIME": 1.0,
             "EXTENDED_SYS_STATE": 1.0,
@@ -757,7 +755,7 @@ class LinkProtocol:
         self._log(now_ns, logging.WARNING, "restart", f"autopilot: {why}; asking for its streams again")
         self._epoch += 1
         self.timesync.reset()
-        for history in (self._attitudes, self._locals, self._globals, self._odometry):
+        for history in (self._attitudes, self._locals, self._odometry):
             history.clear()
         self._break_odometry()
         self._last_local = None
@@ -896,16 +894,6 @@ class LinkProtocol:
         if self._odometry.add(boot_ns, arrival_ns, sample):
             self._last_odometry = boot_ns, sample
 
-    def _on_global_position(self, m: MavlinkMessage, arrival_ns: int) -> None:
-        if not _is_position(m.lat, m.lon):
-            self.counts["empty.GLOBAL_POSITION_INT"] += 1
-            return
-        boot_ns = self._boot_ns(m.time_boot_ms, arrival_ns)
-        if boot_ns is None:
-            return
-        if not self._globals.add(boot_ns, arrival_ns, _Global(m.lat / 1e7, m.lon / 1e7, m.alt / 1e3)):
-            self.counts["out_of_order"] += 1
-
     def _on_gps_raw(self, m: MavlinkMessage, arrival_ns: int) -> None:
         def sigma(accuracy_mm: int, dilution_hundredths: int) -> float | None:
             # Accuracies are extensions: absent they read 0. Dilution: 65535 is unknown.
@@ -921,7 +909,29 @@ class LinkProtocol:
         vertical = sigma(m.v_acc, m.epv)
         if vertical is None and horizontal is not None:
             vertical = 2.0 * horizontal  # the geometry of satellites above the horizon
-        self._gps_raw = _GpsRaw(arrival_ns, m.fix_type, horizontal, vertical)
+        if not _is_position(m.lat, m.lon):
+            self.counts["empty.GPS_RAW_INT"] += 1
+        self._gps_raw = _GpsRaw(
+            arrival_ns,
+            self._fix_boot_ns(m.time_usec * 1000),
+            m.fix_type if _is_position(m.lat, m.lon) else dialect.GPS_FIX_TYPE_NO_FIX,
+            m.lat / 1e7,
+            m.lon / 1e7,
+            m.alt / 1e3,
+            horizontal,
+            vertical,
+        )
+
+    def _fix_boot_ns(self, time_ns: int) -> int | None:
+        """Boot time of a fix. Its own stamp may be of another clock, or zero; then it is as old as the newest
+        message."""
+        newest_ns = self._newest_boot_ns
+        if newest_ns is None:
+            return None
+        if 0 < time_ns < newest_ns:
+            time_ns += (newest_ns - time_ns) // _BOOT_WRAP_NS * _BOOT_WRAP_NS
+        fresh = -_GNSS_FRESH_NS <= time_ns - newest_ns <= _MAX_EXTRAPOLATION_NS
+        return time_ns if fresh else newest_ns
 
     def _on_origin(self, m: MavlinkMessage, arrival_ns: int) -> None:
         if not _is_position(m.latitude, m.longitude):
@@ -1151,35 +1161,26 @@ class LinkProtocol:
         if (
             raw is None
             or abs(stamp_ns - raw.arrival_ns) > _GNSS_FRESH_NS
+            or raw.boot_ns is None
             or raw.fix_type < dialect.GPS_FIX_TYPE_3D_FIX
             or raw.sigma_horizontal_m is None
             or raw.sigma_vertical_m is None
             or raw.sigma_horizontal_m > _GNSS_MAX_SIGMA_M
         ):
             return None
-        # A sample across the date line is not interpolated to: the mean of 180 and -180 is the wrong side.
-        chosen = _choose(
-            self._globals.around(time_ns, by_boot),
-            time_ns,
-            _MAX_GLOBAL_EXTRAPOLATION_NS,
-            lambda a, b: abs(a.longitude_deg - b.longitude_deg) < 180.0,
-        )
-        if chosen is None:
+        then, epoch = self._odometry_at(raw.boot_ns, True)
+        now, same = self._odometry_at(time_ns, by_boot)
+        if then is None or now is None or epoch != same:
             return None
-        a, b, t = chosen
-        at = a
-        if b is not None:
-            at = _Global(
-                (1.0 - t) * a.latitude_deg + t * b.latitude_deg,
-                (1.0 - t) * a.longitude_deg + t * b.longitude_deg,
-                (1.0 - t) * a.height_amsl_m + t * b.height_amsl_m,
-            )
+        latitude_deg, longitude_deg, height_amsl_m = moved(
+            raw.latitude_deg, raw.longitude_deg, raw.height_amsl_m, now - then
+        )
         return GnssPosition(
-            at.latitude_deg,
-            at.longitude_deg,
-            at.height_amsl_m,
-            raw.sigma_horizontal_m,
-            raw.sigma_vertical_m,
+            latitude_deg,
+            longitude_deg,
+            height_amsl_m,
+            max(raw.sigma_horizontal_m, _GNSS_LEAST_SIGMA_M),
+            max(raw.sigma_vertical_m, _GNSS_LEAST_SIGMA_VERTICAL_M),
         )
 
     def statistics(self, now_ns: int) -> dict[str, Statistic]:

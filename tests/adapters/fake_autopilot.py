@@ -243,9 +243,6 @@ class FakeAutopilot:
             d.MAVLINK_MSG_ID_LOCAL_POSITION_NED: lambda ms: d.MAVLink_local_position_ned_message(
                 ms, 5.0 * ms / 1000.0 + self.position_step, 2.0, -80.0, 5.0, 0.0, 0.0
             ),
-            d.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: lambda ms: d.MAVLink_global_position_int_message(
-                ms, 507000000, 71000000, 140000, 80000, 500, 0, 0, 0
-            ),
             d.MAVLINK_MSG_ID_GPS_RAW_INT: lambda ms: d.MAVLink_gps_raw_int_message(
                 0, 3, 507000000, 71000000, 140000, 80, 120, 500, 0, 14, h_acc=1500, v_acc=2500
             ),

@@ -225,7 +225,7 @@ def test_own_heartbeat_and_requests():
     beats = [m for m in script.said if m.get_type() == "HEARTBEAT"]
     assert 5 <= len(beats) <= 6
     assert (beats[0].type, beats[0].autopilot, beats[0].system_status) == (18, 8, 5)
-    assert {31, 32, 33, 24, 2, 245, 193} <= set(script.commands(511))
+    assert {31, 32, 24, 2, 245, 193} <= set(script.commands(511))
     assert {148, 49, 242} <= set(script.commands(512))
     px4 = Script(autopilot=12)
     px4.run(3.0)
@@ -485,35 +485,100 @@ def test_boot_time_comes_round_after_49_days():
     assert script.protocol.state_at(script.now).ned_from_body is not None
 
 
-def gps(fix=3, h_acc=1500, eph=80):
-    return dialect.MAVLink_gps_raw_int_message(0, fix, 0, 0, 0, eph, 150, 0, 0, 12, h_acc=h_acc, v_acc=0)
+LAT, LON = 500000000, 71000000
+M_PER_DEG_NORTH = 111229.0  # at 50 degrees
+
+
+def gps(fix=3, h_acc=2000, eph=80, lat=LAT, lon=LON, time_ms=0, v_acc=0, alt=123000):
+    return dialect.MAVLink_gps_raw_int_message(
+        time_ms * 1000, fix, lat, lon, alt, eph, 150, 0, 0, 12, h_acc=h_acc, v_acc=v_acc
+    )
+
+
+def north_of(script: Script, stamp: int) -> float:
+    """Metres north of (LAT, LON) that the state names."""
+    return (script.protocol.state_at(stamp).gnss.latitude_deg - LAT / 1e7) * M_PER_DEG_NORTH
 
 
 def test_gnss_is_what_the_receiver_vouches_for():
     script = Script()
-    lat = [500000000]
+    script.hear(gps())
+    assert script.protocol.state_at(script.now) is None
 
     def move():
-        lat[0] += 20
-        if script.now // (20 * MS) % 10 == 0:
-            script.hear(
-                dialect.MAVLink_global_position_int_message(script.boot_ms(), lat[0], 71000000, 123000, 0, 0, 0, 0, 0)
-            )
+        script.local([0.0, 0.0, 0.0], [0.0, 10.0, -2.0])
 
     script.run(3.0, move=move)
     assert script.protocol.state_at(script.now).gnss is None
     script.hear(gps())
     gnss = script.protocol.state_at(script.now - 100 * MS).gnss
-    assert gnss.latitude_deg == pytest.approx((lat[0] - 100) / 1e7, abs=2.5e-6)
-    assert (gnss.height_amsl_m, gnss.sigma_horizontal_m, gnss.sigma_vertical_m) == (123.0, 1.5, 4.5)
+    # A metre west of where it was heard, and 20 cm lower.
+    assert (gnss.longitude_deg - LON / 1e7) * 71695.0 == pytest.approx(-1.0, abs=0.1)
+    assert gnss.height_amsl_m == pytest.approx(122.8, abs=0.03)
+    assert (gnss.sigma_horizontal_m, gnss.sigma_vertical_m) == (2.0, 4.5)
     script.hear(gps(h_acc=0))
     assert script.protocol.state_at(script.now).gnss.sigma_horizontal_m == pytest.approx(2.4)
-    for bad in (gps(fix=2), gps(h_acc=0, eph=65535), gps(eph=900), gps(h_acc=60000)):
+    for bad in (
+        gps(fix=2), gps(h_acc=0, eph=65535), gps(eph=900), gps(h_acc=60000), gps(lat=0, lon=0), gps(lat=2**31 - 1),
+    ):  # fmt: skip
         script.hear(bad)
         assert script.protocol.state_at(script.now).gnss is None
     script.hear(gps())
-    script.run(2.0, move=move)
+    script.run(1.4, move=move)
+    assert script.protocol.state_at(script.now).gnss is not None
+    script.run(0.6, move=move)
     assert script.protocol.state_at(script.now).gnss is None, "stale"
+
+
+def test_gnss_sigma_has_a_floor():
+    """A receiver's 1 cm is of its noise; the datum of maps alone is a metre off."""
+    script = Script()
+    script.run(2.0, move=lambda: script.local([0.0, 0.0, 0.0]))
+    script.hear(gps(h_acc=10, v_acc=20))
+    gnss = script.protocol.state_at(script.now).gnss
+    assert (gnss.sigma_horizontal_m, gnss.sigma_vertical_m) == (1.5, 2.5)
+
+
+def test_gnss_is_the_receivers_not_the_filters():
+    """The filter holds our own fixes; 300 m apart, it is the receiver's that counts."""
+    script = Script()
+
+    def move():
+        script.local([300.0, 0.0, 0.0])
+        script.hear(
+            dialect.MAVLink_global_position_int_message(
+                script.boot_ms(), LAT + 26970, LON, 123000, 0, 0, 0, 0, 0
+            )
+        )
+
+    script.run(3.0, move=move)
+    script.hear(gps())
+    assert north_of(script, script.now) == pytest.approx(0.0, abs=0.01)
+    assert 33 not in script.commands(511)
+
+
+@pytest.mark.parametrize("answered", [True, False])
+@pytest.mark.parametrize("clock", ["boot", "unix", "none"])
+def test_gnss_is_carried_from_its_own_time(clock, answered):
+    """The fix is told 0.4 s late, the vehicle flies at 10 m/s."""
+    script = Script()
+
+    def fly():
+        script.local([0.0, 0.0, 0.0], [10.0, 0.0, 0.0])
+
+    script.run(3.0, move=fly)
+    fixed = script.now
+    script.run(0.4, move=fly)
+    times = {"boot": script.boot_ms(fixed), "unix": 1_764_000_000_000, "none": 0}
+    script.hear(gps(time_ms=times[clock]))
+    late_m = 0.0 if clock == "boot" else -4.0
+    for age_s in (0.1, 0.4):
+        expected = 10.0 * (0.4 - age_s) + late_m
+        assert north_of(script, script.now - round(age_s * S)) == pytest.approx(expected, abs=0.15)
+    # Across a break of the odometry nothing is carried.
+    script.local([0.0, 0.0, 0.0], [math.nan, 0.0, 0.0])
+    script.run(0.1, move=fly)
+    assert script.protocol.state_at(script.now).gnss is None
 
 
 def test_stopped_and_slow_streams_are_asked_for_again():
