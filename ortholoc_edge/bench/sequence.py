@@ -13,13 +13,15 @@ A flight folder holds photos and one ``*_flight.csv`` (UTF-8, comma, header), a 
 An OrthoLoC sample is an ``.npz`` with ``image_query`` (H, W, 3) uint8, ``image_dop`` (h, w, 3) uint8, ``dsm``
 (h, w, 3) float32 coordinates of the pixel centres (or (h, w) heights with ``scale`` and an origin at 0),
 ``scale`` in m (a number, or a pair whose second is negative where y falls with the row), ``extrinsics`` (3 or
-4, 4) camera_from_map, ``intrinsics`` (3, 3). A folder of samples is one sequence of unrelated frames.
+4, 4) camera_from_map, ``intrinsics`` (3, 3). Heights far from the sample's median count as holes. A folder
+of samples is one sequence of unrelated frames.
 """
 
 from __future__ import annotations
 
 import csv
 import datetime
+import logging
 import zipfile
 import zlib
 from dataclasses import dataclass
@@ -36,7 +38,12 @@ from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.grid import RasterGrid
 from ortholoc_edge.geometry.rigid import Rigid3
 
+logger = logging.getLogger(__name__)
+
 _EQUAL_STAMP_STEP_NS = 100_000_000
+# Around the median height of a sample's surface, some hundred metres wide: beyond are blunders of its
+# photogrammetry.
+_MAX_BELOW_M, _MAX_ABOVE_M = 200.0, 1000.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -241,9 +248,9 @@ def _rows_run_north(dsm: Any) -> bool:
 
 
 def _surface(dsm: Any, dx: float, dy: float, path: Path) -> tuple[Float32Array, float, float]:
-    """Heights (h, w) and the outer corner of the first pixel."""
+    """Heights (h, w), NaN where implausible, and the outer corner of the first pixel."""
     if dsm.ndim == 2:
-        return np.asarray(dsm, dtype=np.float32), 0.0, 0.0
+        return _plausible(dsm, path), 0.0, 0.0
     if dsm.ndim != 3 or dsm.shape[2] != 3:
         raise DatasetError(f"{path}: dsm is {dsm.shape}, expected (h, w, 3) coordinates or (h, w) heights")
     rows, columns = np.nonzero(np.isfinite(dsm).all(axis=2))
@@ -259,7 +266,28 @@ def _surface(dsm: Any, dx: float, dy: float, path: Path) -> tuple[Float32Array, 
             f"{path}: dsm coordinates and scale ({dx}, {dy}) disagree by {misfit.max():.2f} m; "
             "is the sign of the second scale right?"
         )
-    return np.asarray(dsm[:, :, 2], dtype=np.float32), west, top
+    return _plausible(dsm[:, :, 2], path), west, top
+
+
+def _plausible(heights: Any, path: Path) -> Float32Array:
+    kept = np.array(heights, dtype=np.float32)
+    finite = np.isfinite(kept)
+    if not finite.any():
+        return kept
+    above_m = kept - np.median(kept[finite])
+    # Comparisons with NaN are false: holes are not counted.
+    wrong = (above_m < -_MAX_BELOW_M) | (above_m > _MAX_ABOVE_M)
+    if wrong.any():
+        logger.warning(
+            "%s: %d of %d heights are more than %g m below or %g m above the median; taken as holes",
+            path.stem,
+            np.count_nonzero(wrong),
+            np.count_nonzero(finite),
+            _MAX_BELOW_M,
+            _MAX_ABOVE_M,
+        )
+        kept[wrong] = np.nan
+    return kept
 
 
 def _proper(extrinsics: FloatArray) -> Rigid3:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ortholoc_edge.bench import sequence
+from ortholoc_edge.bench.runner import sample_store
 from ortholoc_edge.errors import CameraError, DatasetError
 from ortholoc_edge.geometry import frames, rotation
 from ortholoc_edge.geometry.rigid import Rigid3
@@ -244,6 +245,34 @@ def test_sample_pose_camera_and_holes(tmp_path):
     assert (sample.camera.fx, sample.camera.fy, sample.camera.cx, sample.camera.cy) == (50.0, 51.0, 19.5, 14.5)
     assert np.isnan(sample.dsm[3, 4])
     assert np.isfinite(sample.dsm).sum() == 12 * 16 - 1
+
+
+@pytest.mark.parametrize("kind", ["coordinates", "heights"])
+def test_implausible_heights_are_holes_and_are_told(tmp_path, caplog, kind):
+    """As in seneca's delivered sample: 275 of 729 272 heights lie 700 m below the ground."""
+    values = sample_values()
+    median = float(np.median(values["dsm"][..., 2]))
+    kept = {(0, 0): -190.0, (0, 1): 990.0}
+    gone = {(3, 4): -210.0, (5, 6): 1010.0, (7, 8): -719.0}
+    values["dsm"][9, 9, 2] = np.nan
+    for at, above in (kept | gone).items():
+        values["dsm"][(*at, 2)] = median + above
+    if kind == "heights":
+        values["dsm"] = values["dsm"][..., 2]
+    with caplog.at_level("WARNING"):
+        dsm = sequence.read_sample(written(tmp_path, values)).dsm
+    assert {tuple(at) for at in np.argwhere(np.isnan(dsm))} == {*gone, (9, 9)}
+    assert "S0: 3 of 191 heights" in caplog.text
+
+
+def test_the_delivered_sample_with_spikes_makes_a_pack(caplog):
+    path = REAL / "seneca" / "samples" / "SENECA_R0000.npz"
+    if not path.is_file():
+        pytest.skip(f"{path} is not there: the real samples lie outside the repository")
+    sample = sequence.read_sample(path)
+    assert "SENECA_R0000: 275 of" in caplog.text
+    with sample_store(sample) as store:
+        assert store.ground_near(sample.map_from_camera.translation[:2]) is not None
 
 
 def test_four_by_four_extrinsics_rounded_to_float32(tmp_path):
