@@ -63,6 +63,7 @@ class Summary(Struct, frozen=True, kw_only=True):
     """What a sequence came to; the object that ``replay --json`` prints.
 
     ``recall`` is over all frames; ``te_m``, ``re_deg`` and ``nees`` over the fixes.
+    ``seeds`` runs are in it, with the seeds from ``seed`` on. ``prior`` is what was used, whatever was asked.
     """
 
     sequence: str
@@ -85,6 +86,7 @@ class Summary(Struct, frozen=True, kw_only=True):
     adhop: bool
     adhop_accepted: int
     seed: int
+    seeds: int = 1
 
 
 @dataclass(frozen=True, slots=True)

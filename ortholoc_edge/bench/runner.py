@@ -22,6 +22,14 @@ from ortholoc_edge.pose import pnp
 from ortholoc_edge.tiles.build import PackOptions, build_pack
 from ortholoc_edge.tiles.store import MapStore
 
+# What a summary names as its pack where each sample brings one.
+SAMPLES_PACK = "the samples' own rasters"
+
+
+def prior_used(kind: PriorKind, samples: bool) -> PriorKind:
+    """What a replay really predicts from: a sample has no past, so every prior but NONE is the truth with noise."""
+    return PriorKind.TRUTH_NOISE if samples and kind is not PriorKind.NONE else kind
+
 
 def run_flight(
     recorded: list[sequence.RecordedFrame],
@@ -138,8 +146,9 @@ def summarise(
     prior: PriorKind,
     adhop: bool,
     seed: int,
+    seeds: int = 1,
 ) -> metrics.Summary:
-    """Figures of a replay's results."""
+    """Figures of a replay's results, or of several with ``seeds`` seeds from ``seed`` on."""
     errors = [r.error for r in results if r.error is not None]
     outcomes = [r.outcome for r in results]
     te: FloatArray = np.array([e.te_m for e in errors])
@@ -164,4 +173,5 @@ def summarise(
         adhop=adhop,
         adhop_accepted=sum(getattr(o, "adhop_accepted", None) is True for o in outcomes),
         seed=seed,
+        seeds=seeds,
     )

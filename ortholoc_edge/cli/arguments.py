@@ -1,20 +1,77 @@
-"""Argument types that several commands share."""
+"""Argument types that several commands share: what they refuse is a usage error, exit code 2."""
 
 from __future__ import annotations
 
 import argparse
+import math
+import tempfile
+from pathlib import Path
 
 from ortholoc_edge.bench.replay import Length
-from ortholoc_edge.errors import ConfigError
+from ortholoc_edge.errors import ConfigError, OrtholocError
+
+Triple = tuple[float, float, float]
 
 
-def triple(text: str) -> tuple[float, float, float]:
-    """``1,2,3``"""
+def any_triple(text: str) -> Triple:
+    """``1,2,3``; NaN too, where the pipeline has an answer to it."""
     try:
         a, b, c = (float(part) for part in text.split(","))
     except ValueError as err:
         raise argparse.ArgumentTypeError(f"{text!r} is not three numbers with commas") from err
     return a, b, c
+
+
+def triple(text: str) -> Triple:
+    """``1,2,3``, finite."""
+    numbers = any_triple(text)
+    if not all(math.isfinite(number) for number in numbers):
+        raise argparse.ArgumentTypeError(f"{text!r} is not three finite numbers")
+    return numbers
+
+
+def sigma_triple(text: str) -> Triple:
+    """``1,1,3``: three finite 1-sigmas, none below zero."""
+    sigmas = triple(text)
+    if min(sigmas) < 0:
+        raise argparse.ArgumentTypeError(f"{text!r}: a sigma is never below zero")
+    return sigmas
+
+
+def geodetic(text: str) -> Triple:
+    """``LAT,LON,AMSL``"""
+    latitude, longitude, height = triple(text)
+    if abs(latitude) > 90 or abs(longitude) > 180:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not on the Earth: latitude from -90 to 90, longitude from -180 to 180 degrees"
+        )
+    return latitude, longitude, height
+
+
+def non_negative(text: str) -> float:
+    """A finite number of zero or more."""
+    number = _number(text)
+    if number < 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is below zero")
+    return number
+
+
+def positive(text: str) -> float:
+    """A finite number above zero."""
+    number = _number(text)
+    if number <= 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not above zero")
+    return number
+
+
+def positive_int(text: str) -> int:
+    """1, 2, 3, …"""
+    return _whole(text, 1)
+
+
+def seed(text: str) -> int:
+    """0, 1, 2, …"""
+    return _whole(text, 0)
 
 
 def length(text: str) -> Length:
@@ -23,3 +80,36 @@ def length(text: str) -> Length:
         return Length.parse(text)
     except ConfigError as err:
         raise argparse.ArgumentTypeError(str(err)) from err
+
+
+def writable_folder(folder: Path, option: str) -> None:
+    """Make sure before the work that its results can be written after it.
+
+    Raises: OrtholocError naming the folder and the option.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as err:
+        raise OrtholocError(f"{folder}: can't write results there ({err}); choose another {option}") from err
+
+
+def _number(text: str) -> float:
+    try:
+        number = float(text)
+    except ValueError as err:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from err
+    if not math.isfinite(number):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a finite number")
+    return number
+
+
+def _whole(text: str, least: int) -> int:
+    try:
+        number = int(text)
+    except ValueError as err:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from err
+    if number < least:
+        raise argparse.ArgumentTypeError(f"{text!r} is below {least}")
+    return number

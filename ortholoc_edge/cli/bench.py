@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import msgspec
@@ -15,9 +16,10 @@ from tqdm import tqdm
 
 from ortholoc_edge.bench import metrics, sequence
 from ortholoc_edge.bench.replay import FrameResult, PriorKind, PriorNoise
-from ortholoc_edge.bench.runner import run_flight, run_samples, summarise
+from ortholoc_edge.bench.runner import SAMPLES_PACK, prior_used, run_flight, run_samples, summarise
+from ortholoc_edge.cli.arguments import positive_int
 from ortholoc_edge.cli.progress import ProgressBar
-from ortholoc_edge.errors import DatasetError
+from ortholoc_edge.errors import DatasetError, OrtholocError
 from ortholoc_edge.matching.registry import MATCHERS, make_matcher
 from ortholoc_edge.matching.types import Matcher
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
@@ -46,9 +48,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "bench",
         help="measure matchers, priors and AdHoP on real sequences",
         description="Replays every set below DATA (folders with *_flight.csv, *_dop.tif and *_dsm.tif, or with .npz "
-        "samples) with each matcher, prior and AdHoP setting, over several seeds, and prints a Markdown table. "
+        "samples, or with a subfolder samples of these) with each matcher, prior and AdHoP setting, over several "
+        "seeds, and prints a Markdown table. "
         "NEES and errors are over the fixes of all seeds, recall over all frames; CPU is the median of this "
-        "process per frame, all threads.",
+        "process per frame, all threads. Samples have no past: every prior but none is truth-noise. A set that fails "
+        "is reported on stderr, the next ones go on, and the exit code is 1.",
     )
     parser.add_argument("data", type=Path, metavar="DATA")
     parser.add_argument("--matchers", nargs="+", choices=MATCHERS, default=list(MATCHERS), help="default: all")
@@ -57,40 +61,66 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="default: %(default)s",
     )  # fmt: skip
     parser.add_argument("--adhop", nargs="+", choices=["on", "off"], default=["on", "off"], help="default: both")
-    parser.add_argument("--seeds", type=int, default=5, help="how many, from 0 (default: %(default)s)")
-    parser.add_argument("--working-px", type=int, default=640, help="default: %(default)s")
-    parser.add_argument("--max-keypoints", type=int, default=4096, help="default: %(default)s")
+    parser.add_argument("--seeds", type=positive_int, default=5, help="how many, from 0 (default: %(default)s)")
+    parser.add_argument(
+        "--working-px", type=positive_int, default=640, help="a multiple of 32 for xfeat (default: %(default)s)"
+    )  # fmt: skip
+    parser.add_argument("--max-keypoints", type=positive_int, default=4096, help="default: %(default)s")
     parser.add_argument("--json", action="store_true", help="print one JSON object per row instead of the table")
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     found = _sets(args.data)
+    # Before the sets: what is wrong here is wrong for all of them.
+    matchers = {name: _matcher(name, args) for name in args.matchers}
     if not args.json:
         print(_HEADING)
+    failed = []
     with tempfile.TemporaryDirectory(prefix="ortholoc-bench-") as scratch:
         for one in found:
-            store = _store(one, Path(scratch))
             try:
-                for summary in _rows(one, store, args):
-                    print(msgspec.json.encode(summary).decode() if args.json else _row(summary), flush=True)
-            finally:
-                if store is not None:
-                    store.close()
-    return 0
+                _measure(one, matchers, Path(scratch), args)
+            except OrtholocError as error:
+                print(f"ortholoc-edge: {one.name}: {error}", file=sys.stderr)
+                failed.append(one.name)
+    if failed:
+        print(f"ortholoc-edge: {len(failed)} of {len(found)} sets failed: {', '.join(failed)}", file=sys.stderr)
+    return 1 if failed else 0
 
 
 def _sets(data: Path) -> list[_Set]:
-    found = []
+    found: dict[Path, _Set] = {}
     for folder in sorted(path for path in [data, *data.glob("*")] if path.is_dir()):
+        name = folder.resolve().name
         dop, dsm = sorted(folder.glob("*_dop.tif")), sorted(folder.glob("*_dsm.tif"))
         if list(folder.glob("*_flight.csv")) and dop and dsm:
-            found.append(_Set(folder.name, folder, dop[0], dsm[0]))
+            found.setdefault(folder, _Set(name, folder, dop[0], dsm[0]))
         elif sequence.sample_paths(folder):
-            found.append(_Set(folder.name, folder, None, None))
+            found.setdefault(folder, _Set(name, folder, None, None))
+        samples = folder / "samples"
+        if sequence.sample_paths(samples):
+            found.setdefault(samples, _Set(f"{name} samples", samples, None, None))
     if not found:
         raise DatasetError(f"{data}: no set there; see docs/sequences.md")
-    return found
+    return list(found.values())
+
+
+def _matcher(name: str, args: argparse.Namespace) -> Matcher:
+    with ProgressBar(f"model {name}") as bar:
+        return make_matcher(
+            name, working_px=args.working_px, max_keypoints=args.max_keypoints, threads=1, progress=bar.step
+        )
+
+
+def _measure(one: _Set, matchers: Mapping[str, Matcher], scratch: Path, args: argparse.Namespace) -> None:
+    store = _store(one, scratch)
+    try:
+        for summary in _rows(one, store, matchers, args):
+            print(msgspec.json.encode(summary).decode() if args.json else _row(summary), flush=True)
+    finally:
+        if store is not None:
+            store.close()
 
 
 def _store(one: _Set, scratch: Path) -> MapStore | None:
@@ -99,28 +129,26 @@ def _store(one: _Set, scratch: Path) -> MapStore | None:
     return MapStore(build_pack(one.dop, one.dsm, scratch / one.name, PackOptions()))
 
 
-def _rows(one: _Set, store: MapStore | None, args: argparse.Namespace) -> Iterator[metrics.Summary]:
-    for name in args.matchers:
-        with ProgressBar(f"model {name}") as bar:
-            matcher = make_matcher(
-                name, working_px=args.working_px, max_keypoints=args.max_keypoints, threads=1, progress=bar.step
-            )
-        for prior in args.priors:
-            for adhop in args.adhop:
-                options = LocalizerOptions(adhop=adhop == "on")
-                results: list[FrameResult] = []
-                for seed in tqdm(range(args.seeds), desc=f"{one.name} {name} {prior}", file=sys.stderr, leave=False):
-                    found = _frames(one, store, matcher, options, PriorKind(prior), seed)
-                    results += [replace(result, image=None) for result in found]
-                yield summarise(
-                    results,
-                    name=one.name,
-                    pack="its own",
-                    matcher=matcher,
-                    prior=PriorKind(prior),
-                    adhop=options.adhop,
-                    seed=args.seeds,
-                )
+def _rows(
+    one: _Set, store: MapStore | None, matchers: Mapping[str, Matcher], args: argparse.Namespace
+) -> Iterator[metrics.Summary]:
+    # Samples know fewer priors than can be asked for: none is measured twice.
+    priors = dict.fromkeys(prior_used(PriorKind(asked), samples=store is None) for asked in args.priors)
+    for (name, matcher), prior, adhop in product(matchers.items(), priors, args.adhop):
+        options = LocalizerOptions(adhop=adhop == "on")
+        results: list[FrameResult] = []
+        for seed in tqdm(range(args.seeds), desc=f"{one.name} {name} {prior}", file=sys.stderr, leave=False):
+            results += [replace(r, image=None) for r in _frames(one, store, matcher, options, prior, seed)]
+        yield summarise(
+            results,
+            name=one.name,
+            pack=SAMPLES_PACK if store is None else "built from the set",
+            matcher=matcher,
+            prior=prior,
+            adhop=options.adhop,
+            seed=0,
+            seeds=args.seeds,
+        )
 
 
 def _frames(

@@ -14,9 +14,9 @@ from ortholoc_edge.adapters.camera import read_image
 from ortholoc_edge.bench import draw
 from ortholoc_edge.bench.replay import Length
 from ortholoc_edge.cli import matcher_options
-from ortholoc_edge.cli.arguments import length, triple
+from ortholoc_edge.cli.arguments import any_triple, geodetic, length, sigma_triple, triple, writable_folder
 from ortholoc_edge.config import read_intrinsics
-from ortholoc_edge.errors import CameraError, ConfigError
+from ortholoc_edge.errors import CameraError, ConfigError, OrtholocError
 from ortholoc_edge.geometry import covariance as cov
 from ortholoc_edge.geometry import frames, rotation
 from ortholoc_edge.geometry.camera import Camera
@@ -56,11 +56,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--position",
         type=triple,
         metavar="E,N,H",
-        help="predicted camera position in the pack's CRS and vertical datum, m",
+        help="predicted camera position in the pack's CRS and vertical datum, m; write --position=-1,2,3 if it begins "
+        "with a minus",
     )
     parser.add_argument(
         "--geodetic",
-        type=triple,
+        type=geodetic,
         metavar="LAT,LON,AMSL",
         help="the same as WGS 84 degrees and height above sea level",
     )
@@ -76,13 +77,18 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument(
         "--attitude",
-        type=triple,
+        # NaN is what an autopilot without an attitude says: an answer with a reason, not a usage error.
+        type=any_triple,
         metavar="R,P,Y",
         help="roll, pitch and yaw from true north of the body, degrees; the camera looks straight down, image top "
         "toward the nose. Left out: level, heading unknown",
     )
     parser.add_argument(
-        "--attitude-sigma-deg", type=triple, default=(1.0, 1.0, 3.0), metavar="R,P,Y", help="1-sigma (default: 1,1,3)"
+        "--attitude-sigma-deg",
+        type=sigma_triple,
+        default=(1.0, 1.0, 3.0),
+        metavar="R,P,Y",
+        help="1-sigma (default: 1,1,3)",
     )
     parser.add_argument("--calibrate", action="store_true", help="solve for the focal length too")
     parser.add_argument("--json", action="store_true", help="print JSON")
@@ -92,6 +98,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
+    if args.overlay is not None:
+        if args.overlay.is_dir():
+            raise OrtholocError(f"{args.overlay}: is a folder; choose another --overlay, the name of a PNG file")
+        writable_folder(args.overlay.parent, "--overlay")
     try:
         image = read_image(args.image)
     except CameraError as error:
@@ -145,8 +155,6 @@ def _prior(args: argparse.Namespace, store: MapStore) -> PosePrior | RegionPrior
                 _MAX_UNAIDED_SIDE_M,
             )
         return RegionPrior(store.bounds)
-    if not np.isfinite(position).all():
-        raise ConfigError(f"the position {tuple(position)} is not finite")
     position = np.array(position, dtype=np.float64)
     below = float(store.heights(position[None, :2])[0])
     above_m = position[2] - below if math.isfinite(below) else 0.0

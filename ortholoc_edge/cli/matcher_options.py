@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from ortholoc_edge.cli.arguments import positive_int
 from ortholoc_edge.cli.progress import ProgressBar
 from ortholoc_edge.config import MatcherOptions
 from ortholoc_edge.matching.registry import MATCHERS, make_matcher
@@ -15,12 +16,17 @@ def add(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("matching")
     group.add_argument("--matcher", choices=MATCHERS, default="xfeat", help="default: %(default)s")
     group.add_argument(
-        "--working-px", type=int, default=640, help="long side at which images are matched, px (default: %(default)s)"
+        "--working-px",
+        type=positive_int,
+        default=640,
+        help="long side at which images are matched, px; a multiple of 32 for xfeat (default: %(default)s)",
     )
     group.add_argument(
-        "--max-keypoints", type=int, default=4096, help="per image; fewer are faster (default: %(default)s)"
+        "--max-keypoints", type=positive_int, default=4096, help="per image; fewer are faster (default: %(default)s)"
     )
-    group.add_argument("--threads", type=int, default=1, help="threads of one inference (default: %(default)s)")
+    group.add_argument(
+        "--threads", type=positive_int, default=1, help="threads of one inference (default: %(default)s)"
+    )
     group.add_argument("--model", type=Path, metavar="FILE", help="an ONNX file instead of the built model")
     group.add_argument("--model-sha256", metavar="HASH", help="refuse --model unless it has this SHA-256")
     group.add_argument("--no-adhop", action="store_true", help="one matching round only")

@@ -19,10 +19,10 @@ from ortholoc_edge.bench.replay import (
     PriorKind,
     PriorNoise,
 )
-from ortholoc_edge.bench.runner import run_flight, run_samples, summarise
+from ortholoc_edge.bench.runner import SAMPLES_PACK, prior_used, run_flight, run_samples, summarise
 from ortholoc_edge.cli import matcher_options
-from ortholoc_edge.cli.arguments import length, triple
-from ortholoc_edge.errors import ConfigError, DatasetError
+from ortholoc_edge.cli.arguments import length, non_negative, seed, sigma_triple, writable_folder
+from ortholoc_edge.errors import ConfigError, DatasetError, OrtholocError
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
 from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.store import MapStore
@@ -46,11 +46,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         choices=[str(k) for k in PriorKind],
         default=str(PriorKind.ODOMETER),
         help="odometer: last fix carried on by dead reckoning; gps: a noisy position per frame; truth-noise: truth "
-        "with noise per frame; none: only a region around the footprint, as in the paper (default: %(default)s)",
+        "with noise per frame, and what samples get for these three, having no past; none: only a region around the "
+        "footprint, as in the paper (default: %(default)s)",
     )
     parser.add_argument(
         "--attitude-sigma-deg",
-        type=triple,
+        type=sigma_triple,
         default=(1.0, 1.0, 3.0),
         metavar="R,P,Y",
         help="1-sigma of roll, pitch, yaw (default: 1,1,3)",
@@ -67,12 +68,16 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--height-sigma", type=length, default=Length(metres=2.0), metavar="LENGTH", help="vertical (default: 2m)"
     )
     parser.add_argument(
-        "--odometer-error", type=float, default=2.0, metavar="PERCENT", help="of the distance (default: %(default)s)"
+        "--odometer-error",
+        type=non_negative,
+        default=2.0,
+        metavar="PERCENT",
+        help="of the distance (default: %(default)s)",
     )
     parser.add_argument(
-        "--odometer-drift", type=float, default=0.05, metavar="M_PER_S", help="over time (default: %(default)s)"
+        "--odometer-drift", type=non_negative, default=0.05, metavar="M_PER_S", help="over time (default: %(default)s)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of all noise (default: %(default)s)")
+    parser.add_argument("--seed", type=seed, default=0, help="of all noise (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="write frames.jsonl, overlays/*.png, track.png and summary.json there"
@@ -82,7 +87,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
-    kind = PriorKind(args.prior)
     noise = PriorNoise(
         args.attitude_sigma_deg,
         (args.position_sigma, args.height_sigma),
@@ -91,10 +95,13 @@ def run(args: argparse.Namespace) -> int:
     )
     options = LocalizerOptions(adhop=not args.no_adhop)
     samples = sequence.sample_paths(args.sequence)
+    kind = prior_used(PriorKind(args.prior), bool(samples))
     if not args.sequence.exists():
         raise DatasetError(f"{args.sequence}: no such file or folder")
     if not samples and args.pack is None:
         raise ConfigError("--pack is missing; build one with: ortholoc-edge tiles build --dop … --dsm … --out PACK")
+    if args.out:
+        writable_folder(args.out, "--out")
     matcher = matcher_options.matcher(args)
     writer = report.FrameWriter(args.out) if args.out else None
     results: list[FrameResult] = []
@@ -116,7 +123,7 @@ def run(args: argparse.Namespace) -> int:
             if args.out and store is not None:
                 caption = f"{args.sequence.name}: {matcher.name}, prior {kind}"
                 write_png(args.out / "track.png", report.track_picture(store, results, caption))
-        pack_name = "the samples' own rasters" if args.pack is None else str(args.pack)
+        pack_name = SAMPLES_PACK if args.pack is None else str(args.pack)
     finally:
         if writer is not None:
             writer.close()
@@ -131,6 +138,9 @@ def run(args: argparse.Namespace) -> int:
     )
     encoded = msgspec.json.encode(summary)
     if args.out:
-        (args.out / "summary.json").write_bytes(encoded + b"\n")
+        try:
+            (args.out / "summary.json").write_bytes(encoded + b"\n")
+        except OSError as err:
+            raise OrtholocError(f"{args.out}: can't write summary.json ({err})") from err
     print(encoded.decode() if args.json else report.table(summary))
     return 0

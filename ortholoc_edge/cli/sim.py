@@ -13,7 +13,8 @@ from tqdm import tqdm
 
 from ortholoc_edge.bench.metrics import Spread
 from ortholoc_edge.cli import matcher_options
-from ortholoc_edge.errors import ConfigError
+from ortholoc_edge.cli.arguments import positive, seed, writable_folder
+from ortholoc_edge.errors import ConfigError, OrtholocError
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
 from ortholoc_edge.tiles.pack import Pack
 
@@ -32,9 +33,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--out", type=Path, default=Path("out"), metavar="DIR", help="for track.png and summary.json (default: out)"
     )
-    parser.add_argument("--seed", type=int, default=1, help="of sensor errors, wind and noise (default: %(default)s)")
+    parser.add_argument("--seed", type=seed, default=1, help="of sensor errors, wind and noise (default: %(default)s)")
     parser.add_argument(
-        "--duration", type=float, default=65.0, metavar="S", help="of the flight, at least 30 (default: %(default)s)"
+        "--duration", type=positive, default=65.0, metavar="S", help="of the flight, at least 30 (default: %(default)s)"
     )
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     matcher_options.add(parser)
@@ -48,6 +49,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.duration < 30.0:
         raise ConfigError("a flight of less than 30 s leaves too little after GNSS is lost")
+    writable_folder(args.out, "--out")
     # Build the model now, with its progress bar; the daemon then finds it.
     matcher_options.matcher(args)
     options = FlightOptions(
@@ -64,10 +66,12 @@ def run(args: argparse.Namespace) -> int:
     finally:
         done.set()
         ticker.join()
-    args.out.mkdir(parents=True, exist_ok=True)
     draw_track(report, Pack.open(demo_pack_path()), args.out / "track.png")
     summary = report.summary()
-    (args.out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    try:
+        (args.out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    except OSError as err:
+        raise OrtholocError(f"{args.out}: can't write summary.json ({err})") from err
     print(json.dumps(summary) if args.json else _table(report, args))
     return 0 if report.passed else 1
 

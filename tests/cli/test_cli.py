@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -94,6 +95,78 @@ def test_usage_errors_are_code_two(capsys: pytest.CaptureFixture[str]) -> None:
     assert "5km" in capsys.readouterr().err
 
 
+NUMBERS = [
+    ("replay x --seed=-1", "seed"),
+    ("replay x --seed 1.5", "seed"),
+    ("replay x --attitude-sigma-deg=-1,1,3", "below zero"),
+    ("replay x --attitude-sigma-deg=1,nan,3", "finite"),
+    ("replay x --attitude-sigma-deg 1,3", "three numbers"),
+    ("replay x --odometer-drift nan", "finite"),
+    ("replay x --odometer-drift=-inf", "finite"),
+    ("replay x --odometer-error -5", "below zero"),
+    ("replay x --odometer-error much", "not a number"),
+    ("replay x --position-sigma nan", "no length"),
+    ("replay x --threads 0", "threads"),
+    ("replay x --working-px -32", "working-px"),
+    ("replay x --max-keypoints 0", "max-keypoints"),
+    ("sim --seed=-1", "seed"),
+    ("sim --duration nan", "finite"),
+    ("sim --duration inf", "finite"),
+    ("sim --duration 0", "above zero"),
+    ("bench x --seeds 0", "seeds"),
+    ("bench x --seeds=-3", "seeds"),
+    ("bench x --working-px 0", "working-px"),
+    ("localize x --pack y --position nan,2,3", "finite"),
+    ("localize x --pack y --position 1,2", "three numbers"),
+    ("localize x --pack y --geodetic 999,0,2", "latitude"),
+    ("localize x --pack y --geodetic 0,181,2", "longitude"),
+    ("localize x --pack y --geodetic 0,0,inf", "finite"),
+    ("localize x --pack y --attitude a,b,c", "three numbers"),
+    ("localize x --pack y --attitude-sigma-deg nan,1,1", "finite"),
+    ("localize x --pack y --attitude-sigma-deg 1,-1,1", "below zero"),
+]
+
+
+@pytest.mark.parametrize(("line", "named"), NUMBERS, ids=[line for line, _ in NUMBERS])
+def test_impossible_numbers_are_usage_errors(line: str, named: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(line.split())
+    assert stop.value.code == 2
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert "error: argument --" in told
+    assert named in told
+
+
+@pytest.mark.parametrize("command", ["replay x --pack y", "sim", "bench ."])
+def test_working_size_for_xfeat_is_named(
+    command: str, tmp_path: Path, flight: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "x").symlink_to(flight)
+    (tmp_path / "s").mkdir()
+    (tmp_path / "s" / "a.npz").touch()
+    assert run(*command.split(), "--working-px", "650") == EXIT_CONFIG
+    assert "multiple of 32" in capsys.readouterr().err
+
+
+def test_results_that_could_not_be_written_are_told_before_the_work(
+    tmp_path: Path, photo: Path, intrinsics: Path, flight: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    taken = tmp_path / "file"
+    taken.touch()
+    for option, arguments in (
+        ("--out", ["sim", "--out", taken / "out"]),
+        ("--out", ["replay", flight, "--pack", PACK, "--out", taken]),
+        ("--overlay", ["localize", photo, "--pack", PACK, "--intrinsics", intrinsics, "--overlay", taken / "a.png"]),
+        ("--overlay", ["localize", photo, "--pack", PACK, "--intrinsics", intrinsics, "--overlay", tmp_path]),
+    ):
+        assert run(*arguments, *SIFT) == EXIT_FAILED
+        told = capsys.readouterr()
+        assert told.out == ""
+        assert str(tmp_path) in told.err
+        assert f"choose another {option}" in told.err
+
+
 def test_entry_as_a_process() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "ortholoc_edge", "tiles", "info", "/nowhere/pack"],
@@ -162,7 +235,6 @@ def test_contradictions(photo: Path, intrinsics: Path, flight: Path, capsys: pyt
     cases = [
         (["--position", "1,2,3", "--geodetic", "1,2,3", "--intrinsics", intrinsics], "--geodetic"),
         (["--attitude", "0,0,0", "--intrinsics", intrinsics], "--position"),
-        (["--position", "nan,2,3", "--intrinsics", intrinsics], "finite"),
         ([], "--intrinsics"),
     ]
     for more, named in cases:
@@ -245,6 +317,23 @@ def test_localize_for_people(photo: Path, intrinsics: Path, capsys: pytest.Captu
     # Half a turn off: no fix, and why.
     assert run(*given, "--attitude", "0,0,210", *SIFT) == EXIT_FAILED
     assert capsys.readouterr().out.startswith("no fix: ")
+
+
+def test_localize_with_an_attitude_that_is_not_a_number(
+    photo: Path, intrinsics: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ["localize", photo, "--pack", PACK, "--intrinsics", intrinsics, "--position", position()]
+    assert run(*given, "--attitude", "nan,0,0", "--json", *SIFT) == EXIT_FAILED
+    record = json.loads(capsys.readouterr().out)
+    assert (record["fix"], record["reason"]) == (False, "bad_attitude")
+
+
+def test_localize_with_sigmas_of_zero(photo: Path, intrinsics: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Truth told as certain: a fix or a reason, never a traceback."""
+    sure = ["--position-sigma", "0", "--height-sigma", "0", "--attitude-sigma-deg", "0,0,0", "--attitude", "0,0,30"]
+    given = ["localize", photo, "--pack", PACK, "--intrinsics", intrinsics, "--position", position(off_m=(0, 0, 0))]
+    assert run(*given, *sure, "--json", *SIFT) in (0, EXIT_FAILED)
+    assert "fix" in json.loads(capsys.readouterr().out)
 
 
 def test_localize_without_a_prior(photo: Path, intrinsics: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -337,8 +426,51 @@ def test_replay_of_an_ortholoc_sample(kind: str, tmp_path: Path, capsys: pytest.
         extrinsics=np.column_stack([inverse.rotation, inverse.translation]),
         intrinsics=rendered.CAMERA.matrix,
     )
+    given = ["replay", tmp_path / "sample.npz", "--json", "--no-adhop", *SIFT]
+    for asked, used in (("odometer", "truth-noise"), ("gps", "truth-noise"), ("none", "none")):
+        assert run(*given, "--prior", asked) == 0
+        assert json.loads(capsys.readouterr().out)["prior"] == used
     assert run("replay", tmp_path / "sample.npz", "--json", "--prior", "none", *SIFT) == 0
     summary = json.loads(capsys.readouterr().out)
     assert (summary["frames"], summary["fixes"]) == (1, 1)
+    assert (summary["seed"], summary["seeds"]) == (0, 1)
     assert summary["te_m"]["max"] < 3.0
     assert summary["re_deg"]["max"] < 2.0
+
+
+# -- bench -------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def sets(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A flight with rasters, a broken sample beside it, and a set that can't be read."""
+    data = tmp_path_factory.mktemp("data")
+    for name in ("good", "also"):
+        shutil.copytree(flight, data / name)
+        for raster in ("dop", "dsm"):
+            shutil.copy(PACK / f"{raster}.tif", data / name / f"{name}_{raster}.tif")
+    next((data / "also").glob("*_flight.csv")).write_text("nothing\n1\n", encoding="utf-8")
+    (data / "good" / "samples").mkdir()
+    (data / "good" / "samples" / "a.npz").write_bytes(b"no archive")
+    return data
+
+
+def test_bench_goes_on_after_a_set_that_fails(sets: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = ["bench", sets, "--matchers", "sift", "--priors", "odometer", "--adhop", "off", "--seeds", "2"]
+    assert run(*given, "--json") == EXIT_FAILED
+    told = capsys.readouterr()
+    (line,) = told.out.splitlines()
+    summary = json.loads(line)
+    assert (summary["sequence"], summary["pack"]) == ("good", "built from the set")
+    assert (summary["frames"], summary["seed"], summary["seeds"]) == (2 * len(FLIGHT), 0, 2)
+    assert re.search(r"ortholoc-edge: also: .*flight\.csv", told.err)
+    assert re.search(r"ortholoc-edge: good samples: .*a\.npz", told.err)
+    assert "2 of 3 sets failed: also, good samples" in told.err
+
+
+def test_bench_of_one_set_finds_its_samples_once(sets: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = ["bench", sets / "good", "--matchers", "sift", "--priors", "odometer", "--adhop", "off", "--seeds", "1"]
+    assert run(*given) == EXIT_FAILED
+    told = capsys.readouterr()
+    assert [line.split(" | ")[0] for line in told.out.splitlines()[2:]] == ["| good"]
+    assert "1 of 2 sets failed: good samples" in told.err
