@@ -29,6 +29,7 @@ from rasterio.windows import Window
 from ortholoc_edge.errors import ConfigError, MapError
 from ortholoc_edge.geometry.grid import RasterGrid
 from ortholoc_edge.tiles.cog import BLOCK_PX, Cog, block_cache, quiet_georeference, raster_grid
+from ortholoc_edge.tiles.collar import Collar, windows
 from ortholoc_edge.tiles.georeference import (
     Georeference,
     VerticalDatum,
@@ -64,13 +65,18 @@ _SENTINELS = (-9999.0, -32767.0, -32768.0)
 _SENTINEL_MAGNITUDE = 1e30
 # The Dead Sea's shore lies at -430 m, Everest at 8849 m.
 _MIN_HEIGHT_M, _MAX_HEIGHT_M = -500.0, 9000.0
+# Of the cells with data: up to here heights beyond these are spikes, from here on the file is not understood.
+_MAX_SPIKE_SHARE = 0.01
+
+# Zeros from the border inward are fill where hardly any (1 %) of the other heights come near zero.
+_FILL_DISTANCE_M = 50.0
+_MAX_NEAR_FILL_SHARE = 0.01
+# Black from the border inward is fill from this share of the orthophoto on; less may be a shadow or a lake.
+_MIN_BLACK_SHARE = 0.005
 
 # LERC's error should vanish beside the DSM's own: 2 cm, less for the finer grids of low flights.
 _MAX_Z_ERROR_M = 0.02
 _MAX_Z_ERROR_PER_GSD = 1.0 / 20.0
-
-# Pixels per side of one step of the copy, whole blocks: 12 MB of RGB, 32 MB of heights in float64.
-_CHUNK_PX = 2048
 
 # GDAL takes 5 % of the machine's memory by default.
 _BUILD_CACHE_BYTES = 256 * 2**20
@@ -464,16 +470,36 @@ def _normalise_dop(source: _Source, work: Path, done: Callable[[float], None]) -
     A fourth band without the alpha flag is infrared in the state surveys' orthophotos, so only the flag makes
     it a mask.
     """
-    dataset = source.dataset
+    dataset, grid = source.dataset, source.grid
     alpha = _alpha_band(dataset)
     bands = [1, 2, 3] if dataset.count - (alpha is not None) >= 3 else [1, 1, 1]
+
+    def step(window: Window) -> tuple[Any, npt.NDArray[np.bool_]]:
+        pixels = _read(source, bands, window)
+        return pixels, _read(source, alpha, window) > 127 if alpha is not None else _mask(source, window)
+
+    def black(window: Window) -> npt.NDArray[np.bool_]:
+        pixels, valid = step(window)
+        found: npt.NDArray[np.bool_] = valid & ~pixels.any(axis=0)
+        return found
+
+    collar = Collar(grid.width, grid.height, black)
+    share = collar.cells / (grid.width * grid.height)
+    if fill := share >= _MIN_BLACK_SHARE:
+        logger.warning(
+            "%s: black from the border inward, %.1f %% of it, taken for no data, though the file does not declare it;"
+            " nearblack -setmask or gdal_edit.py -a_nodata 0 does",
+            source.path,
+            100 * share,
+        )
     profile = _work_profile(source, count=3, dtype="uint8", photometric="RGB")
     valid_px = 0
     # Internal, so that the COG driver carries the mask into the one file.
     with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(work, "w", **profile) as target:
-        for window in _chunks(source.grid, done):
-            pixels = _read(source, bands, window)
-            valid = _read(source, alpha, window) > 127 if alpha is not None else _mask(source, window)
+        for window in _chunks(grid, done):
+            pixels, valid = step(window)
+            if fill:
+                valid &= ~collar.mask(window)
             # One colour outside: what a lossy source has there is noise that costs bytes.
             pixels *= valid
             target.write(pixels, window=window)
@@ -481,7 +507,7 @@ def _normalise_dop(source: _Source, work: Path, done: Callable[[float], None]) -
             valid_px += int(np.count_nonzero(valid))
     if valid_px == 0:
         raise MapError(f"{source.path}: no valid pixel; check its nodata value or mask with gdalinfo")
-    return valid_px / (source.grid.width * source.grid.height)
+    return valid_px / (grid.width * grid.height)
 
 
 def _normalise_dsm(source: _Source, work: Path, valid_work: Path, done: Callable[[float], None]) -> float:
@@ -489,25 +515,29 @@ def _normalise_dsm(source: _Source, work: Path, valid_work: Path, done: Callable
 
     Returns: the share of valid cells.
     """
-    dataset = source.dataset
-    scale, offset = dataset.scales[0], dataset.offsets[0]
     profile = _work_profile(source, count=1, dtype="float32", nodata=NODATA, predictor=3)
-    valid_px, undeclared = 0, set()
     valid_profile = _work_profile(source, count=1, dtype="float32")
+    collar = _zero_collar(source)
+    valid_px, spikes_px, undeclared = 0, 0, set()
+    lowest, highest = np.inf, -np.inf
     with rasterio.open(work, "w", **profile) as target, rasterio.open(valid_work, "w", **valid_profile) as share:
         for window in _chunks(source.grid, done):
-            raw = _read(source, 1, window).astype(np.float64)
-            valid = _mask(source, window) & np.isfinite(raw)
-            low_or_huge = valid & ((raw < _MIN_HEIGHT_M) | (raw > _SENTINEL_MAGNITUDE))
-            if low_or_huge.any():
-                sentinel = low_or_huge & (np.isin(raw, _SENTINELS) | (np.abs(raw) > _SENTINEL_MAGNITUDE))
-                undeclared.update(np.unique(raw[sentinel]).tolist())
-                valid &= ~sentinel
-            heights = raw * scale + offset
-            _check_heights(heights[valid], source.path)
+            heights, valid, sentinels = _heights(source, window)
+            undeclared.update(sentinels)
+            if collar is not None:
+                valid &= ~collar.mask(window)
+            spikes = valid & ((heights < _MIN_HEIGHT_M) | (heights > _MAX_HEIGHT_M))
+            if spikes.any():
+                spikes_px += int(np.count_nonzero(spikes))
+                lowest = min(lowest, float(heights[spikes].min()))
+                highest = max(highest, float(heights[spikes].max()))
+                valid &= ~spikes
             target.write(np.where(valid, heights, NODATA).astype(np.float32), 1, window=window)
             share.write(valid.astype(np.float32), 1, window=window)
             valid_px += int(np.count_nonzero(valid))
+    if spikes_px:
+        spike_share = spikes_px / (valid_px + spikes_px)
+        _judge_spikes(source.path, spikes_px, spike_share, lowest, highest)
     if valid_px == 0:
         raise MapError(f"{source.path}: no valid height; check its nodata value with gdalinfo")
     if undeclared:
@@ -520,15 +550,65 @@ def _normalise_dsm(source: _Source, work: Path, valid_work: Path, done: Callable
     return valid_px / (source.grid.width * source.grid.height)
 
 
-def _check_heights(heights: npt.NDArray[np.float64], path: Path) -> None:
-    if not len(heights):
-        return
-    low, high = float(heights.min()), float(heights.max())
-    if low < _MIN_HEIGHT_M or high > _MAX_HEIGHT_M:
+def _heights(source: _Source, window: Window) -> tuple[Any, npt.NDArray[np.bool_], list[float]]:
+    """Heights in metres, their validity, and the undeclared nodata values among them."""
+    dataset = source.dataset
+    raw = _read(source, 1, window).astype(np.float64)
+    valid = _mask(source, window) & np.isfinite(raw)
+    sentinels = []
+    low_or_huge = valid & ((raw < _MIN_HEIGHT_M) | (raw > _SENTINEL_MAGNITUDE))
+    if low_or_huge.any():
+        sentinel = low_or_huge & (np.isin(raw, _SENTINELS) | (np.abs(raw) > _SENTINEL_MAGNITUDE))
+        sentinels = np.unique(raw[sentinel]).tolist()
+        valid &= ~sentinel
+    return raw * dataset.scales[0] + dataset.offsets[0], valid, sentinels
+
+
+def _zero_collar(source: _Source) -> Collar | None:
+    """Heights of exactly zero from the border inward, if the rest of the surface lies far from zero."""
+    grid = source.grid
+
+    def zero(window: Window) -> npt.NDArray[np.bool_]:
+        heights, valid, _ = _heights(source, window)
+        found: npt.NDArray[np.bool_] = valid & (heights == 0.0)
+        return found
+
+    collar = Collar(grid.width, grid.height, zero)
+    if collar.cells == 0:
+        return None
+    rest, near = 0, 0
+    for window in windows(grid.width, grid.height):
+        heights, valid, _ = _heights(source, window)
+        valid &= ~collar.mask(window)
+        rest += int(np.count_nonzero(valid))
+        near += int(np.count_nonzero(valid & (np.abs(heights) <= _FILL_DISTANCE_M)))
+    if rest == 0 or near > _MAX_NEAR_FILL_SHARE * rest:
+        return None
+    logger.warning(
+        "%s: heights of exactly 0 from the border inward, %.1f %% of it, taken for nodata, though the file does not"
+        " declare it; gdal_edit.py -a_nodata 0 does",
+        source.path,
+        100 * collar.cells / (grid.width * grid.height),
+    )
+    return collar
+
+
+def _judge_spikes(path: Path, count: int, share: float, lowest: float, highest: float) -> None:
+    limits = f"{_MIN_HEIGHT_M:g} to {_MAX_HEIGHT_M:g} m"
+    if share >= _MAX_SPIKE_SHARE:
         raise MapError(
-            f"{path}: heights from {low:g} to {high:g} m, beyond {_MIN_HEIGHT_M:g} to {_MAX_HEIGHT_M:g} m;"
+            f"{path}: {100 * share:.1f} % of the heights lie beyond {limits} ({lowest:g} to {highest:g} m);"
             " probably an undeclared nodata value, declare it with: gdal_edit.py -a_nodata VALUE"
         )
+    logger.warning(
+        "%s: %d heights (%.2g %%) beyond %s (%g to %g m) taken for nodata",
+        path,
+        count,
+        100 * share,
+        limits,
+        lowest,
+        highest,
+    )
 
 
 def _read(source: _Source, bands: int | list[int], window: Window) -> Any:
@@ -551,16 +631,10 @@ def _alpha_band(dataset: Any) -> int | None:
 
 
 def _chunks(grid: RasterGrid, done: Callable[[float], None]) -> Iterator[Window]:
-    for window in _windows(grid.width, grid.height):
+    for window in windows(grid.width, grid.height):
         yield window
         if window.col_off + window.width == grid.width:
             done((window.row_off + window.height) / grid.height)
-
-
-def _windows(width: int, height: int) -> Iterator[Window]:
-    for row in range(0, height, _CHUNK_PX):
-        for column in range(0, width, _CHUNK_PX):
-            yield Window(column, row, min(_CHUNK_PX, width - column), min(_CHUNK_PX, height - row))
 
 
 def _work_profile(source: _Source, **more: Any) -> dict[str, Any]:
@@ -621,7 +695,7 @@ def _with_surface_levels(work: Path, valid_work: Path) -> Path:
         ):
             profile.update(width=averaged.width, height=averaged.height, transform=averaged.transform)
             with rasterio.open(work.with_name(name), "w", **profile) as target:
-                for window in _windows(averaged.width, averaged.height):
+                for window in windows(averaged.width, averaged.height):
                     heights = averaged.read(1, window=window)
                     # Rounding of GDAL's weights must not decide over exactly 3 of 4.
                     heights[share.read(1, window=window) < _MIN_VALID_SHARE - 1e-4] = NODATA

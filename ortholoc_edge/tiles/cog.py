@@ -81,8 +81,8 @@ class Cog:
                 raise MapError(
                     f"{path}: blocks of {full.block_shapes[0]} px, expected {BLOCK_PX}; rebuild the pack"
                 )
-            # The overviews share the extent of the full resolution; where their size is rounded (DOP down, DSM up),
-            # their pixels are a trifle larger or smaller than 2^k of the full ones.
+            # The overviews share the extent of the full resolution; where their size is rounded (DOP down,
+            # DSM up), their pixels are a trifle larger or smaller than 2^k of the full ones.
             grid = raster_grid(full, path)
             self.grids = (grid, *(grid.resized(one.width, one.height) for one in self._levels[1:]))
         except (RasterioError, OSError) as err:

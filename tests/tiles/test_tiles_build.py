@@ -210,6 +210,66 @@ def test_undeclared_nodata_is_taken_for_it_and_said_so(scene, tmp_path, caplog, 
     assert np.isinf(sentinel) or "taken for nodata" in caplog.text
 
 
+def test_undeclared_zeros_around_the_surface_are_nodata_and_said_so(scene, tmp_path, caplog):
+    heights = dsm_heights()
+    collar = np.zeros(heights.shape[1:], dtype=bool)
+    collar[:, :300] = collar[600:, :] = True
+    lake = np.zeros_like(collar)
+    lake[100:120, 400:430] = True  # away from the border: the file says so, let it stand
+    heights[0, collar | lake] = 0.0
+    dsm = write_raster(tmp_path / "dsm.tif", heights, DSM_GRID)
+    with caplog.at_level(logging.WARNING):
+        pack = build_pack(scene[0], dsm, tmp_path / "pack")
+    assert np.array_equal(dsm_of(pack) == -9999.0, collar)
+    assert pack.manifest.dsm.valid_fraction == pytest.approx(1 - collar.mean())
+    assert f"{dsm}: heights of exactly 0 from the border inward, {100 * collar.mean():.1f} %" in caplog.text
+
+
+def test_zeros_beside_low_ground_are_sea(scene, tmp_path, caplog):
+    heights = dsm_heights() - 300.0  # -26 to 44 m
+    heights[0, :, :300] = 0.0
+    dsm = write_raster(tmp_path / "dsm.tif", heights, DSM_GRID)
+    pack = build_pack(scene[0], dsm, tmp_path / "pack")
+    assert pack.manifest.dsm.valid_fraction == 1.0
+    flat = write_raster(tmp_path / "flat.tif", np.zeros_like(heights), DSM_GRID)
+    assert build_pack(scene[0], flat, tmp_path / "flat").manifest.dsm.valid_fraction == 1.0
+    assert "nodata" not in caplog.text
+
+
+def test_undeclared_black_around_the_orthophoto_is_no_data_and_said_so(scene, tmp_path, caplog):
+    pixels = dop_pixels()
+    collar = np.zeros(pixels.shape[1:], dtype=bool)
+    collar[:40], collar[:, -200:] = True, True
+    roof = np.zeros_like(collar)
+    roof[500:700, 500:700] = True
+    pixels[:, collar | roof] = 0
+    dop = write_raster(tmp_path / "dop.tif", pixels, DOP_GRID)
+    with caplog.at_level(logging.WARNING):
+        pack = build_pack(dop, scene[1], tmp_path / "pack")
+    assert np.array_equal(~dop_of(pack)[1], collar)
+    assert f"{dop}: black from the border inward" in caplog.text
+    pixels = dop_pixels()
+    pixels[:, :60, :60] = 0  # 0.2 % of it: a shadow
+    dop = write_raster(tmp_path / "shadow.tif", pixels, DOP_GRID)
+    assert build_pack(dop, scene[1], tmp_path / "shadow").manifest.dop.valid_fraction == 1.0
+
+
+def test_few_absurd_heights_are_nodata_and_said_so(scene, tmp_path, caplog):
+    heights = dsm_heights()
+    heights[0, 50:52, 60:80] = -719.3
+    heights[0, 300, 300:310] = 12_000.0
+    dsm = write_raster(tmp_path / "dsm.tif", heights, DSM_GRID)
+    with caplog.at_level(logging.WARNING):
+        pack = build_pack(scene[0], dsm, tmp_path / "pack")
+    spikes = (heights[0] < 0) | (heights[0] > 9000)
+    assert np.array_equal(dsm_of(pack) == -9999.0, spikes)
+    assert f"{dsm}: 50 heights (0.01 %) beyond -500 to 9000 m (-719.3 to 12000 m) taken for nodata" in caplog.text
+    heights[0, :20] = -719.3
+    dsm = write_raster(tmp_path / "other.tif", heights, DSM_GRID)
+    with pytest.raises(MapError, match=r"other.tif: 3\.\d % of the heights lie beyond"):
+        build_pack(scene[0], dsm, tmp_path / "other")
+
+
 def test_scaled_integer_heights_are_scaled(scene, tmp_path):
     path = tmp_path / "dsm.tif"
     stored = np.rint(dsm_heights() * 100 - 30000).astype(np.int16)
