@@ -77,6 +77,26 @@ def test_a_changed_model_file_is_refused_by_name_with_remedy(filled: Path) -> No
     models.load("xfeat")
 
 
+def test_a_changed_graph_with_a_record_to_match_is_refused(filled: Path) -> None:
+    onnx = pytest.importorskip("onnx")
+    path, record = filled / "xfeat.onnx", filled / "xfeat.json"
+    model = onnx.load(path)
+    weight = next(one for one in model.graph.initializer if one.name == "block_fusion.0.w")
+    weight.raw_data = bytes(len(weight.raw_data))
+    path.write_bytes(model.SerializeToString())
+    entries = json.loads(record.read_text())
+    record.write_text(json.dumps(entries | {"sha256": models.sha256_of(path.read_bytes())}))
+    with pytest.raises(ModelError, match=r"xfeat\.onnx differs from the published xfeat.*models build xfeat"):
+        models.ensure("xfeat")
+    with pytest.raises(ModelError, match=r"model file .*xfeat\.onnx differs from the published xfeat"):
+        models.load_file(path, None)
+    renamed = path.rename(filled / "mine.onnx")
+    record.rename(filled / "mine.json")
+    with pytest.raises(ModelError, match=r"mine\.onnx differs from the published xfeat"):
+        models.load_file(renamed, None)
+    assert models.load_file(renamed, models.sha256_of(renamed.read_bytes())).name == "mine"
+
+
 @pytest.mark.parametrize("record", ["", "[]", "{}", '{"sha256": 5}', "\x00"])
 def test_a_damaged_record_is_refused(filled: Path, record: str) -> None:
     (filled / "xfeat.json").write_text(record)
