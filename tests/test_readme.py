@@ -45,10 +45,34 @@ def test_links_of_the_documents_lead_somewhere():
             assert (document.parent / target).exists(), f"{document.name} links to {target}"
 
 
+# Names that may stand in prose as they are: MAVLink's, the system's, a file's.
+ALL_CAPS = {
+    "VISION_POSITION_ESTIMATE",
+    "LOCAL_POSITION_NED",
+    "GLOBAL_POSITION_INT",
+    "ATTITUDE_QUATERNION",
+    "CLOCK_MONOTONIC",
+    "SOURCE_DATE_EPOCH",
+    "THIRD_PARTY_NOTICES",
+}
+
+
+def test_documents_have_no_placeholder_left():
+    for document in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "config").glob("*.md")]:
+        text = document.read_text(encoding="utf-8")
+        prose = re.sub(r"^```.*?^```|`[^`\n]*`", "", text, flags=re.DOTALL | re.MULTILINE)
+        found = set(re.findall(r"\b[A-Z]{3,}(?:_[A-Z]{3,})+\b", prose)) - ALL_CAPS
+        assert not found, f"{document.name}: placeholders {sorted(found)}"
+
+
 def test_modules_that_the_architecture_names_exist():
     text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     for name in re.findall(r"`((?:adapters|bench|pipeline|matching|pose|tiles|geometry)/\w+\.py)`", text):
         assert (ROOT / "ortholoc_edge" / name).is_file(), name
+
+
+# Keys whose value in the example is not the default, since the default is seldom what a vehicle needs.
+NOT_THE_DEFAULT = {"camera.latency_ms", "log.folder"}
 
 
 def test_example_configuration_has_every_key_with_its_default():
@@ -56,7 +80,6 @@ def test_example_configuration_has_every_key_with_its_default():
     example = ROOT / "config" / "example.toml"
     parsed = config.read_config(example)
     text = example.read_text(encoding="utf-8")
-    example_only = {"camera.latency_ms", "camera.source", "link.endpoint", "log.folder", "map.pack"}
 
     def check(value: msgspec.Struct, prefix: str) -> None:
         for field in msgspec.structs.fields(value):
@@ -65,7 +88,16 @@ def test_example_configuration_has_every_key_with_its_default():
                 check(have, f"{key}.")
                 continue
             assert re.search(rf"^(# )?{field.encode_name} = ", text, re.MULTILINE), f"{key} is not in the example"
-            if prefix != "intrinsics." and key not in example_only and not field.required:
+            if prefix != "intrinsics." and key not in NOT_THE_DEFAULT and not field.required:
                 assert have == field.default, f"{key}: the example says {have}, the default is {field.default}"
 
     check(parsed, "")
+
+
+def test_example_marks_what_is_not_the_default():
+    text = (ROOT / "config" / "example.toml").read_text(encoding="utf-8")
+    told = (ROOT / "config" / "README.md").read_text(encoding="utf-8")
+    for key in NOT_THE_DEFAULT:
+        assert f"`{key}`" in told
+        assert re.search(rf"^{key.split('.')[1]} = .*# example \(default", text, re.MULTILINE), key
+    assert text.count("# example (default") == len(NOT_THE_DEFAULT)
