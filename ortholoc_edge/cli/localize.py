@@ -63,7 +63,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--geodetic",
         type=geodetic,
         metavar="LAT,LON,AMSL",
-        help="the same as WGS 84 degrees and height above sea level",
+        help="the same as WGS 84 degrees and height above sea level; likewise --geodetic=-33.86,151.21,90",
     )
     parser.add_argument(
         "--position-sigma",
