@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -44,6 +44,13 @@ _MAX_UNDULATION_M = 120.0
 _MAX_UNDULATION_DISAGREEMENT_M = 3.0
 
 _EGM96_EPSG = 5773
+_NAVD88_EPSG = 5703
+
+# 1 sigma of the way from a map height to EGM96's: by a grid (interpolation, slope of the geoid over the area), or
+# by taking another sea level for it.
+_GRID_SIGMA_M = 0.1
+_ZERO_LEVEL_SIGMA_M = 1.0
+_NAVD88_SIGMA_M = 2.0
 _AREA_MARGIN_DEG = 0.5
 
 VerticalKind = Literal["ellipsoid", "orthometric", "unknown"]
@@ -62,6 +69,9 @@ class VerticalDatum(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         ellipsoid_minus_map_m: add to a map height to get the height above the WGS 84 ellipsoid; None: not
             known.
         derivation: where the offsets come from, one sentence for people.
+        amsl_sigma_m: 1 sigma of ``amsl_minus_map_m``, an error common to the whole pack: 0 if it is exact or the
+            user stated it, 0.1 through a geoid grid of PROJ's, 1 (NAVD88: 2) where another sea level was taken
+            for EGM96's; None: not known (no offset, or a pack built before this was written).
     """
 
     kind: VerticalKind
@@ -70,6 +80,7 @@ class VerticalDatum(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     amsl_minus_map_m: float | None = None
     ellipsoid_minus_map_m: float | None = None
     derivation: str | None = None
+    amsl_sigma_m: Annotated[float, msgspec.Meta(ge=0)] | None = None
 
     def amsl_from_map(self, height_map_m: float) -> float:
         """Height above mean sea level (EGM96), m. Raises: MapError where the pack does not say."""
@@ -341,7 +352,7 @@ def derive_vertical(
 
     Offsets come from PROJ where it has the geoid grid, else from the undulation that the user stated. Heights
     above a sea level whose grid is missing are taken as AMSL: the national zeros lie within 0.2-1 m of
-    EGM96's (NAVD88: 1-2 m), and the derivation says so.
+    EGM96's (NAVD88: 1-2 m); the derivation says so and ``amsl_sigma_m`` has the figure.
     Args:
         geoid_undulation_m: height of the geoid above the ellipsoid in the area, m.
         lat_lon_deg: place; None for a local frame, where PROJ cannot help.
@@ -366,16 +377,17 @@ def derive_vertical(
         if epsg is not None:
             raise ConfigError("--vertical-epsg names a sea level; it goes with --vertical orthometric")
         _check_undulation(geoid_undulation_m, amsl_minus_ellipsoid)
-        derivation = "geoid EGM96 through PROJ"
+        derivation, sigma_m = "geoid EGM96 through PROJ", _GRID_SIGMA_M
         if amsl_minus_ellipsoid is None and geoid_undulation_m is not None:
             amsl_minus_ellipsoid = -geoid_undulation_m
-            derivation = f"geoid {geoid_undulation_m:+.2f} m above the ellipsoid, as stated"
+            derivation, sigma_m = f"geoid {geoid_undulation_m:+.2f} m above the ellipsoid, as stated", 0.0
         return VerticalDatum(
             kind="ellipsoid",
             name="WGS 84 ellipsoid",
             amsl_minus_map_m=amsl_minus_ellipsoid,
             ellipsoid_minus_map_m=0.0,
             derivation=derivation if amsl_minus_ellipsoid is not None else "no geoid grid in PROJ, none stated",
+            amsl_sigma_m=None if amsl_minus_ellipsoid is None else sigma_m,
         )
     name = None if epsg is None else _vertical_name(epsg)
     ellipsoid_minus_map = None if epsg is None else _grid_offset(f"EPSG:4326+{epsg}", "EPSG:4979", lat_lon_deg)
@@ -383,10 +395,12 @@ def derive_vertical(
         _check_undulation(geoid_undulation_m, -ellipsoid_minus_map)
     if ellipsoid_minus_map is not None and amsl_minus_ellipsoid is not None:
         amsl, derivation = ellipsoid_minus_map + amsl_minus_ellipsoid, f"{name} and EGM96 through PROJ"
+        sigma_m = 0.0 if epsg == _EGM96_EPSG else _GRID_SIGMA_M
     elif epsg == _EGM96_EPSG:
-        amsl, derivation = 0.0, "heights are EGM96's own"
+        amsl, sigma_m, derivation = 0.0, 0.0, "heights are EGM96's own"
     else:
         amsl, derivation = 0.0, "its zero taken as EGM96's, which is true to about 1 m (NAVD88: 2 m)"
+        sigma_m = _NAVD88_SIGMA_M if epsg == _NAVD88_EPSG else _ZERO_LEVEL_SIGMA_M
     if ellipsoid_minus_map is None and geoid_undulation_m is not None:
         ellipsoid_minus_map = geoid_undulation_m
         derivation += f"; geoid {geoid_undulation_m:+.2f} m above the ellipsoid, as stated"
@@ -397,6 +411,7 @@ def derive_vertical(
         amsl_minus_map_m=amsl,
         ellipsoid_minus_map_m=ellipsoid_minus_map,
         derivation=derivation,
+        amsl_sigma_m=sigma_m,
     )
 
 

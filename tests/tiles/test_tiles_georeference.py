@@ -223,6 +223,25 @@ def test_missing_geoid_grid_is_no_silent_zero():
 
 
 @pytest.mark.parametrize(
+    ("kind", "epsg", "undulation_m", "sigma_m"),
+    [
+        ("ellipsoid", None, 47.0, 0.0),
+        ("ellipsoid", None, None, None),
+        ("orthometric", 5773, None, 0.0),
+        ("orthometric", None, None, 1.0),
+        ("orthometric", 7837, 47.0, 1.0),  # the stated undulation says nothing of its zero against EGM96's
+        ("orthometric", 5703, None, 2.0),
+        ("unknown", None, None, None),
+    ],
+)
+def test_error_of_the_way_to_sea_level(kind, epsg, undulation_m, sigma_m):
+    vertical = derive_vertical(kind, epsg, undulation_m, (48.0, 10.0))
+    assert vertical.amsl_sigma_m == sigma_m
+    assert (vertical.amsl_sigma_m is None) == (vertical.amsl_minus_map_m is None)
+    assert Georeference(None, vertical, (0.0, 0.0)).vertical.amsl_sigma_m == sigma_m
+
+
+@pytest.mark.parametrize(
     ("arguments", "kind", "message"),
     [
         (("unknown", None, 47.0), ConfigError, "--vertical"),
@@ -255,8 +274,9 @@ def test_geoid_grid_is_used_where_proj_has_it(tmp_path):
         grid.update_tags(1, positive_value="up", target_crs_epsg_code="5773")
     pyproj.datadir.append_data_dir(r"{tmp_path}")
     inside = derive_vertical("ellipsoid", None, None, (48.2, 10.0))
-    assert abs(inside.amsl_minus_map_m + 47.5) < 1e-3, inside
+    assert abs(inside.amsl_minus_map_m + 47.5) < 1e-3 and inside.amsl_sigma_m == 0.1, inside
     egm96 = derive_vertical("orthometric", 5773, None, (48.2, 10.0))
+    assert egm96.amsl_sigma_m == 0.0, egm96
     assert abs(egm96.ellipsoid_minus_map_m - 47.5) < 1e-3 and abs(egm96.amsl_minus_map_m) < 1e-3, egm96
     outside = derive_vertical("ellipsoid", None, None, (20.0, 10.0))
     assert outside.amsl_minus_map_m is None, outside

@@ -22,6 +22,15 @@ def test_round_trip(holed_pack, tmp_path):
     assert len(holed_pack.manifest.dop.crcs()) > 1
 
 
+def test_pack_from_before_the_sigma_of_sea_level_opens(copied):
+    assert Pack.open(copied).manifest.vertical.amsl_sigma_m == 1.0
+    edit(copied, lambda m: m["vertical"].pop("amsl_sigma_m"))
+    assert Pack.open(copied).manifest.vertical.amsl_sigma_m is None
+    edit(copied, lambda m: m["vertical"].update(amsl_sigma_m=-1.0))
+    with pytest.raises(MapError, match=r"vertical\.amsl_sigma_m"):
+        Pack.open(copied)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
