@@ -12,6 +12,9 @@ from ortholoc_edge.errors import ConfigError, OrtholocError
 
 Triple = tuple[float, float, float]
 
+# Beyond the Earth's size; also of the coordinates of any projection.
+_MAX_LENGTH_M = 1e8
+
 
 def any_triple(text: str) -> Triple:
     """``1,2,3``; NaN too, where the pipeline has an answer to it."""
@@ -30,18 +33,26 @@ def triple(text: str) -> Triple:
     return numbers
 
 
+def map_position(text: str) -> Triple:
+    """``E,N,H`` in m."""
+    place = triple(text)
+    if max(abs(part) for part in place) > _MAX_LENGTH_M:
+        raise argparse.ArgumentTypeError(f"{text!r} is not on the Earth")
+    return place
+
+
 def sigma_triple(text: str) -> Triple:
-    """``1,1,3``: three finite 1-sigmas, none below zero."""
+    """``1,1,3``: three 1-sigmas of angles, degrees."""
     sigmas = triple(text)
-    if min(sigmas) < 0:
-        raise argparse.ArgumentTypeError(f"{text!r}: a sigma is never below zero")
+    if min(sigmas) < 0 or max(sigmas) > 180:
+        raise argparse.ArgumentTypeError(f"{text!r}: a sigma of an angle is from 0 to 180 degrees")
     return sigmas
 
 
 def geodetic(text: str) -> Triple:
     """``LAT,LON,AMSL``"""
     latitude, longitude, height = triple(text)
-    if abs(latitude) > 90 or abs(longitude) > 180:
+    if abs(latitude) > 90 or abs(longitude) > 180 or abs(height) > _MAX_LENGTH_M:
         raise argparse.ArgumentTypeError(
             f"{text!r} is not on the Earth: latitude from -90 to 90, longitude from -180 to 180 degrees"
         )
@@ -77,9 +88,12 @@ def seed(text: str) -> int:
 def length(text: str) -> Length:
     """``5``, ``5m`` or ``4%``"""
     try:
-        return Length.parse(text)
+        parsed = Length.parse(text)
     except ConfigError as err:
         raise argparse.ArgumentTypeError(str(err)) from err
+    if max(parsed.metres, parsed.of_height) > _MAX_LENGTH_M:
+        raise argparse.ArgumentTypeError(f"{text!r} is farther than any vehicle flies")
+    return parsed
 
 
 def writable_folder(folder: Path, option: str) -> None:

@@ -14,7 +14,7 @@ from ortholoc_edge.adapters.camera import read_image
 from ortholoc_edge.bench import draw
 from ortholoc_edge.bench.replay import Length
 from ortholoc_edge.cli import matcher_options
-from ortholoc_edge.cli.arguments import any_triple, geodetic, length, sigma_triple, triple, writable_folder
+from ortholoc_edge.cli.arguments import any_triple, geodetic, length, map_position, sigma_triple, writable_folder
 from ortholoc_edge.config import read_intrinsics
 from ortholoc_edge.errors import CameraError, ConfigError, OrtholocError
 from ortholoc_edge.geometry import covariance as cov
@@ -54,7 +54,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument(
         "--position",
-        type=triple,
+        type=map_position,
         metavar="E,N,H",
         help="predicted camera position in the pack's CRS and vertical datum, m; write --position=-1,2,3 if it begins "
         "with a minus",

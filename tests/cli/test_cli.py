@@ -98,7 +98,7 @@ def test_usage_errors_are_code_two(capsys: pytest.CaptureFixture[str]) -> None:
 NUMBERS = [
     ("replay x --seed=-1", "seed"),
     ("replay x --seed 1.5", "seed"),
-    ("replay x --attitude-sigma-deg=-1,1,3", "below zero"),
+    ("replay x --attitude-sigma-deg=-1,1,3", "from 0 to 180"),
     ("replay x --attitude-sigma-deg=1,nan,3", "finite"),
     ("replay x --attitude-sigma-deg 1,3", "three numbers"),
     ("replay x --odometer-drift nan", "finite"),
@@ -123,11 +123,14 @@ NUMBERS = [
     ("localize x --pack y --geodetic 0,0,inf", "finite"),
     ("localize x --pack y --attitude a,b,c", "three numbers"),
     ("localize x --pack y --attitude-sigma-deg nan,1,1", "finite"),
-    ("localize x --pack y --attitude-sigma-deg 1,-1,1", "below zero"),
+    ("localize x --pack y --attitude-sigma-deg 1,-1,1", "from 0 to 180"),
+    ("localize x --pack y --attitude-sigma-deg 1,1e300,1", "from 0 to 180"),
+    ("localize x --pack y --position 1e300,0,0", "not on the Earth"),
+    (f"localize x --pack y --height-sigma {'9' * 400}", "farther than"),
 ]
 
 
-@pytest.mark.parametrize(("line", "named"), NUMBERS, ids=[line for line, _ in NUMBERS])
+@pytest.mark.parametrize(("line", "named"), NUMBERS, ids=[line[:60] for line, _ in NUMBERS])
 def test_impossible_numbers_are_usage_errors(line: str, named: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main(line.split())
