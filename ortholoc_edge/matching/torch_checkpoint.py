@@ -187,8 +187,7 @@ def read_checkpoint(data: bytes, what: str) -> dict[str, npt.NDArray[Any]]:
     Args:
         data: the file's bytes.
         what: its name, for messages.
-    Raises: ModelError for anything that is not a plain dictionary of tensors, damaged or hostile files
-    included.
+    Raises: ModelError for anything that is not a plain dictionary of tensors, damaged or hostile files included.
     """
     try:
         return _read(data)

@@ -1,5 +1,4 @@
-"""XFeat with mutual nearest neighbours: the network on ONNX Runtime, everything around it in numpy and
-OpenCV."""
+"""XFeat with mutual nearest neighbours: the network on ONNX Runtime, everything around it in numpy and OpenCV."""
 
 from __future__ import annotations
 
@@ -140,9 +139,8 @@ class XFeatMatcher:
     def match(self, query: Features, reference: Features) -> Matches:
         """Mutual nearest neighbours of cosine ``min_cosine`` or more.
 
-        ``confidence`` is None: a cosine of descriptors ranks pairs of one image, but it is no probability
-        of being right, and what it means shifts with season and spectrum. Whoever wants one must calibrate
-        it.
+        ``confidence`` is None: a cosine of descriptors ranks pairs of one image, but it is no probability of
+        being right, and what it means shifts with season and spectrum. Whoever wants one must calibrate it.
         """
         i, j = mutual_nearest(query.descriptors, reference.descriptors, self._min_cosine)
         return Matches(query.keypoints_px[i], reference.keypoints_px[j])
@@ -196,12 +194,10 @@ def _keypoints(
 
 
 def _subpixel(heat: Float32Array, v: IntArray, u: IntArray) -> FloatArray:
-    """Offsets (N, 2) of peaks from their pixels, -0.5..0.5: the vertex of a parabola through log heat, per
-    axis.
+    """Offsets (N, 2) of peaks from their pixels, -0.5..0.5: the vertex of a parabola through log heat, per axis.
 
     Not in the published detector. On the four recorded query photos under a known homography it takes the
-    median error from 1.21 to 0.93 px at 1024 px, working at 640; a parabola through the heat itself gives
-    1.01.
+    median error from 1.21 to 0.93 px at 1024 px, working at 640; a parabola through the heat itself gives 1.01.
     """
     logs = np.log(np.maximum(heat, np.float32(1e-6)))
     offsets = np.zeros((len(u), 2))
@@ -225,8 +221,7 @@ def _subpixel(heat: Float32Array, v: IntArray, u: IntArray) -> FloatArray:
 def _cell_position(pixels: FloatArray, axis: int) -> tuple[IntArray, Float32Array]:
     """Cell whose centre is at or before each pixel, and the fraction towards the next.
 
-    The published code scales by W / (W - 1) here, off by up to half a pixel at the rims; this is the plain
-    geometry.
+    The published code scales by W / (W - 1) here, off by up to half a pixel at the rims; this is plain geometry.
     """
     position = (pixels[:, axis] + 0.5) / _CELL - 0.5
     base = np.floor(position)

@@ -1,9 +1,8 @@
 """Writes the XFeat network as an ONNX graph from its published weights; no torch.
 
 Network: Potje et al., "XFeat: Accelerated Features for Lightweight Image Matching", CVPR 2024 (weights
-    Apache-2.0). The structure is read off the weights' names and shapes; what these leave open (strides,
-    where the skip joins, the 8x8 cell order) follows the published model and is proven by a stored
-    reference (`models.verify`).
+Apache-2.0). The structure is read off the weights' names and shapes; what these leave open (strides, where the
+skip joins, the 8x8 cell order) follows the published model and is proven by a stored reference (`models.verify`).
 
 What is changed against the published network, none of which alters its function: the image is normalised
 by mean and variance before it comes in (so that invalid pixels can be left out of both), the batch
@@ -147,8 +146,7 @@ def _outputs(w: _Writer) -> None:
     w.node("Sigmoid", [logit], "reliability")
 
     # 65 logits per 8x8 cell: 64 pixels in row order and "no keypoint here". Softmax over them, last one
-    # dropped. Written out because the runtime's Softmax over axis 1 transposes: 2 ms slower at 640 (shared
-    # notes).
+    # dropped. Written out because the runtime's Softmax over axis 1 transposes: 2 ms slower at 640 (shared notes).
     cells = w.node("SpaceToDepth", [INPUT], "cells", blocksize=_CELL)
     logits = w.plain_conv(w.block(cells, "keypoint_head"), "keypoint_head.3")
     limited = w.node("Min", [logits, w.constant("max_logit", _MAX_LOGIT, np.float32)], "logits_limited")

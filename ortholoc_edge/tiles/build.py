@@ -172,8 +172,7 @@ def build_pack(
         dop, dsm: rasters that GDAL reads, in one projected CRS in metres, or both without CRS (local metres).
         out: directory of the pack.
         progress: called with a fraction 0-1 and what is being done.
-    Raises: MapError for unusable rasters and failed writes; ConfigError for options that contradict each
-        other.
+    Raises: MapError for unusable rasters and failed writes; ConfigError for options that contradict each other.
     """
     options = options or PackOptions()
     say = progress or _silent
@@ -294,8 +293,7 @@ def _check_overlap(dop: _Source, dsm: _Source) -> None:
     shared = max(min(a[2], b[2]) - max(a[0], b[0]), 0.0) * max(min(a[3], b[3]) - max(a[1], b[1]), 0.0)
     if shared == 0.0:
         raise MapError(
-            f"{dsm.path}: covers west, south, east, north {_rounded(b)}, {dop.path.name} covers"
-            f" {_rounded(a)};"
+            f"{dsm.path}: covers west, south, east, north {_rounded(b)}, {dop.path.name} covers {_rounded(a)};"
             " they do not overlap, choose rasters of one area"
         )
     coverage = shared / ((a[2] - a[0]) * (a[3] - a[1]))
@@ -467,8 +465,8 @@ def _described(path: Path, valid_fraction: float) -> _Written:
 def _normalise_dop(source: _Source, work: Path, done: Callable[[float], None]) -> float:
     """Copy to three bands and a mask. Returns: the share of valid pixels.
 
-    A fourth band without the alpha flag is infrared in the state surveys' orthophotos, so only the flag makes
-    it a mask.
+    A fourth band without the alpha flag is infrared in the state surveys' orthophotos, so only the flag makes it
+    a mask.
     """
     dataset, grid = source.dataset, source.grid
     alpha = _alpha_band(dataset)

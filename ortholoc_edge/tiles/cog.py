@@ -116,8 +116,7 @@ class Cog:
     def read_heights(self, level: int, window: PixelWindow) -> Float32Array:
         """Heights (H, W) float32 of a window inside the level, NaN where there is no data."""
         heights: Float32Array = self._read(level, window, with_mask=False)[0][0]
-        # Exact: nodata is the lowest value of its LERC block, and LERC stores a block's lowest value as it
-        # is.
+        # Exact: nodata is the lowest value of its LERC block, and LERC stores a block's lowest value as it is.
         heights[heights == np.float32(self.nodata)] = np.nan
         return heights
 
@@ -196,8 +195,7 @@ class Cog:
                 mask = dataset.read_masks(1, window=area) if with_mask else None
             except (RasterioError, OSError) as err:
                 raise MapDamagedError(
-                    f"{self.path}: level {level} cannot be decoded at pixel ({window.column}, {window.row})"
-                    f" ({err});"
+                    f"{self.path}: level {level} cannot be decoded at pixel ({window.column}, {window.row}) ({err});"
                     " copy the pack again"
                 ) from err
         return bands, mask
@@ -208,8 +206,10 @@ def describe(block: Block) -> str:
 
 
 def raster_grid(dataset: Any, path: Path) -> RasterGrid:
-    """Grid of a north-up rasterio dataset. Raises: MapError for a rotated, mirrored or missing"
-    " geotransform."""
+    """Grid of a north-up rasterio dataset.
+
+    Raises: MapError for a rotated, mirrored or missing geotransform.
+    """
     t = dataset.transform
     if t.b != 0 or t.d != 0:
         raise MapError(

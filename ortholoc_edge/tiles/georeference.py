@@ -66,8 +66,7 @@ class VerticalDatum(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         name: of the vertical datum, for people.
         epsg: EPSG code of the vertical reference system.
         amsl_minus_map_m: add to a map height to get AMSL as the autopilot means it (EGM96); None: not known.
-        ellipsoid_minus_map_m: add to a map height to get the height above the WGS 84 ellipsoid; None: not
-            known.
+        ellipsoid_minus_map_m: add to a map height to get the height above the WGS 84 ellipsoid; None: not known.
         derivation: where the offsets come from, one sentence for people.
         amsl_sigma_m: 1 sigma of ``amsl_minus_map_m``, an error common to the whole pack: 0 if it is exact or the
             user stated it, 0.1 through a geoid grid of PROJ's, 1 (NAVD88: 2) where another sea level was taken
@@ -101,11 +100,9 @@ class VerticalDatum(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     def _offset(self, offset_m: float | None, wanted: str) -> float:
         if offset_m is None:
             raise MapError(
-                f"area pack: heights {wanted} cannot be told from its vertical datum ({self.kind}); rebuild"
-                " it"
-                " with --vertical ellipsoid|orthometric and --geoid-undulation-m METRES (geoid above"
-                " ellipsoid"
-                " there)"
+                f"area pack: heights {wanted} cannot be told from its vertical datum ({self.kind});"
+                " rebuild it with --vertical ellipsoid|orthometric and --geoid-undulation-m METRES"
+                " (geoid above ellipsoid there)"
             )
         return offset_m
 
@@ -171,8 +168,7 @@ class Georeference:
             is 0, scale is 1, and geodetic conversions raise MapError.
         vertical: datum of the pack's heights.
         anchor: (easting, northing) in the area, m; picks the datum transformation that is valid there.
-    Raises: MapError for a system that cannot carry poses: geographic, not in metres, not conformal,
-        unreadable.
+    Raises: MapError for a system that cannot carry poses: geographic, not in metres, not conformal, unreadable.
     """
 
     crs: str | None
@@ -190,8 +186,7 @@ class Georeference:
             ratio = _north_over_east_scale(crs, proj, self.anchor)
             if not abs(ratio - 1.0) <= _MAX_ANISOTROPY:
                 raise MapError(
-                    f"{crs.name}: not conformal, a metre north is {ratio:.4f} of a metre east at"
-                    f" {self.anchor};"
+                    f"{crs.name}: not conformal, a metre north is {ratio:.4f} of a metre east at {self.anchor};"
                     f" reproject with: gdalwarp -t_srs {_utm_code(*proj(*self.anchor, inverse=True))}"
                 )
             transformer = _wgs84_transformer(crs, proj, self.anchor)
@@ -237,8 +232,7 @@ class Georeference:
     def convergence_rad(self, xy_map: npt.ArrayLike) -> float:
         """Angle from true north to grid north at a map position, clockwise positive.
 
-        ``yaw_grid = yaw_true - convergence``; east of a UTM zone's central meridian in the north
-        it is positive.
+        ``yaw_grid = yaw_true - convergence``; east of a UTM zone's central meridian in the north it is positive.
         """
         if self._proj is None:
             return 0.0
@@ -264,9 +258,8 @@ class Georeference:
     def _transform(self, a: float, b: float, direction: Literal["FORWARD", "INVERSE"]) -> tuple[float, float]:
         if self._geodetic_from_map is None:
             raise MapError(
-                "area pack without a CRS: it has local metres only, no latitude and longitude; rebuild it"
-                " from"
-                " rasters with a projected CRS (gdal_translate -a_srs EPSG:n assigns one)"
+                "area pack without a CRS: it has local metres only, no latitude and longitude;"
+                " rebuild it from rasters with a projected CRS (gdal_translate -a_srs EPSG:n assigns one)"
             )
         try:
             first, second = self._geodetic_from_map.transform(a, b, errcheck=True, direction=direction)
@@ -368,8 +361,7 @@ def derive_vertical(
         return VerticalDatum(kind="unknown", derivation="not stated when the pack was built")
     if geoid_undulation_m is not None and not abs(geoid_undulation_m) <= _MAX_UNDULATION_M:
         raise ConfigError(
-            f"--geoid-undulation-m {geoid_undulation_m}: beyond +-{_MAX_UNDULATION_M:.0f} m, where no geoid"
-            " is;"
+            f"--geoid-undulation-m {geoid_undulation_m}: beyond +-{_MAX_UNDULATION_M:.0f} m, where no geoid is;"
             " state the height of the geoid above the ellipsoid in metres"
         )
     amsl_minus_ellipsoid = _grid_offset("EPSG:4979", f"EPSG:4326+{_EGM96_EPSG}", lat_lon_deg)
@@ -451,8 +443,7 @@ def _check_undulation(stated_m: float | None, amsl_minus_ellipsoid: float | None
     if abs(stated_m + amsl_minus_ellipsoid) > _MAX_UNDULATION_DISAGREEMENT_M:
         raise ConfigError(
             f"--geoid-undulation-m {stated_m:+.2f}: PROJ's geoid lies {-amsl_minus_ellipsoid:+.2f} m above"
-            " the"
-            " ellipsoid here; correct the value (the sign is geoid above ellipsoid) or leave it out"
+            " the ellipsoid here; correct the value (the sign is geoid above ellipsoid) or leave it out"
         )
 
 

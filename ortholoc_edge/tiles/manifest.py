@@ -90,16 +90,14 @@ class RasterFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 class Dop(RasterFile, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The orthophoto. ``true_ortho``: roofs upright over their walls; ``sigma_m``: planimetric error, 1"
-    " sigma."""
+    """The orthophoto. ``true_ortho``: roofs upright over their walls; ``sigma_m``: planimetric error, 1 sigma."""
 
     true_ortho: bool | None = None
     sigma_m: _Sigma | None = None
 
 
 class Dsm(RasterFile, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The surface model. ``max_z_error_m``: by compression; ``sigma_m``: vertical error of the source, 1"
-    " sigma."""
+    """The surface model. ``max_z_error_m``: by compression; ``sigma_m``: vertical error of the source, 1 sigma."""
 
     max_z_error_m: _Sigma
     nodata: float

@@ -44,8 +44,7 @@ class Pack:
                 raise MapError(f"{file}: {err.strerror}; rebuild the pack or copy it again") from err
             if size != entry.bytes:
                 raise MapError(
-                    f"{file}: {size} bytes, the manifest says {entry.bytes}; rebuild the pack or copy it"
-                    " again"
+                    f"{file}: {size} bytes, the manifest says {entry.bytes}; rebuild the pack or copy it again"
                 )
         return Pack(path, manifest, Georeference(manifest.crs, manifest.vertical, manifest.anchor))
 

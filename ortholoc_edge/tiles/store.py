@@ -30,8 +30,7 @@ CACHE_BYTES = 64 * 2**20
 # 16 Mpx of RGB and mask are 64 MB; a localizer works on 0.3-1 Mpx.
 MAX_PIXELS = 16_000_000
 
-# A level may be a little coarser than asked for: overview pixels are a trifle larger than 2^k of the full
-# ones.
+# A level may be a little coarser than asked for: overview pixels can be a trifle larger than 2^k of the full ones.
 _LEVEL_SLACK = 1.01
 
 # Of a pixel: bounds that were computed to lie on a pixel's edge should not drag in its neighbour.
@@ -205,8 +204,7 @@ def _coarsest(grids: tuple[RasterGrid, ...], limit_m: float) -> int:
 
 
 def _pixels(grid: RasterGrid, bounds: Bounds, margin: int) -> PixelWindow | None:
-    """Pixels that a region touches, and ``margin`` more on each side, inside the grid; None if it is"
-    " outside."""
+    """Pixels that a region touches, and ``margin`` more on each side, inside the grid; None if it is outside."""
     west, south, east, north = bounds
     rows = sorted(((south - grid.top) / grid.dy, (north - grid.top) / grid.dy))
     spans = []
