@@ -421,11 +421,14 @@ def vision_estimate(
         raise MapError("the pack's heights can't be turned into AMSL; rebuild it with --geoid-undulation-m")
     ned_from_map = frames.map_from_ned_rotation(georeference.convergence_rad(map_from_body.translation[:2])).T
     lever = map_from_body.translation - fix.map_from_camera.translation
+    covariance = cov.rotated(cov.of_moved_point(fix.covariance, lever), ned_from_map)
+    # Common to the whole pack: no match tells of it, so it joins only where the height leaves the pack's datum.
+    covariance[2, 2] += (georeference.vertical.amsl_sigma_m or 0.0) ** 2
     return VisionEstimate(
         fix.stamp_ns,
         ned_from_geodetic(origin, place.lat_deg, place.lon_deg, place.height_amsl_m, model),
         ned_from_map @ map_from_body.rotation,
-        cov.rotated(cov.of_moved_point(fix.covariance, lever), ned_from_map),
+        covariance,
         reset_counter,
         min(fix.quality, 1.0),
     )

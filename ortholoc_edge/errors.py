@@ -5,7 +5,7 @@ OrtholocError
 ├── MapError       an area pack or a raster is missing, damaged or in the wrong reference system
 ├── ModelError     a matcher's weights or graph can't be obtained, verified or run
 ├── CameraError    a frame source can't be opened or read
-├── LinkError      the connection to the autopilot can't be opened
+├── LinkError      the connection to the autopilot, or the bus, can't be opened or has ended
 └── DatasetError   a recorded sequence or a sample can't be read
 
 Every message names the thing, what is wrong with it, and the remedy.
@@ -33,7 +33,7 @@ class CameraError(OrtholocError):
 
 
 class LinkError(OrtholocError):
-    """The connection to the autopilot can't be opened."""
+    """The connection to the autopilot, or the bus, can't be opened or has ended."""
 
 
 class DatasetError(OrtholocError):
