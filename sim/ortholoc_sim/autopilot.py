@@ -52,6 +52,10 @@ class SensorOptions:
         tilt_deg, tilt_time_s: of roll and pitch, slowly varying. yaw_bias_deg: constant; yaw_deg varies.
         velocity_scale: of dead reckoning. velocity_turn_deg: of its direction. velocity_walk: m/s per root
             second of its wandering bias.
+        acceleration_bias: m/s^2, horizontal, constant, in a random direction. An autopilot without velocity aiding
+            integrates accelerometers levelled by its attitude: 0.1 degrees of tilt or 1.8 mg that ten seconds of GNSS
+            do not teach it are 0.018 m/s^2, which is 1 m/s and 27 m after 55 s.
+        climb_m_s, climb_time_s: of the vertical velocity, slowly varying, as of barometer and accelerometer.
         gnss_m: of a GNSS position, correlated over ``gnss_time_s``.
         baro_walk_m: per root second.
     """
@@ -62,7 +66,10 @@ class SensorOptions:
     yaw_deg: float = 0.4
     velocity_scale: float = 0.02
     velocity_turn_deg: float = 1.0
-    velocity_walk: float = 0.06
+    velocity_walk: float = 0.03
+    acceleration_bias: float = 0.018
+    climb_m_s: float = 0.15
+    climb_time_s: float = 8.0
     gnss_m: float = 0.6
     gnss_time_s: float = 20.0
     baro_walk_m: float = 0.05
@@ -78,6 +85,12 @@ class FilterOptions:
         timeout_s: after which a position that keeps being refused is taken. glitch_radius_m: EK3_GLITCH_RAD.
         viso_delay_ms: VISO_DELAY_MS; used with ``stamps="jitter"``.
         quality_min: VISO_QUAL_MIN, per cent; -1 takes all.
+        stamps: how a measurement's capture time is had. "timesync", the default, is not what ArduPilot does: it
+            answers TIMESYNC but stamps external navigation by the least delay seen lately (contract 2.6), which is
+            "jitter". So "timesync" judges the fixes and our protocol, "jitter" what an untuned vehicle would make of
+            them. Measured in one flight each, horizontal error of the autopilot after GNSS was lost: timesync 0.52 m
+            median, 1.18 m at most; jitter with VISO_DELAY_MS 250 (the most there is) at a latency of 474 ms 2.35 m
+            and 3.90 m. Those were with less drift than the default has now.
     """
 
     pos_m_nse: float = 0.2
@@ -284,6 +297,9 @@ class AutopilotCore:
         scale = 1.0 + s.velocity_scale * (1.0 if rng.random() < 0.5 else -1.0)
         self._distortion = scale * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
         self._walk = np.zeros(2)
+        towards = rng.uniform(0.0, 2.0 * np.pi)
+        self._acceleration = s.acceleration_bias * np.array([np.cos(towards), np.sin(towards)])
+        self._climb = np.zeros(1)
         self._gnss_error = s.gnss_m * rng.standard_normal(3)
         self._baro = 0.0
         self._truth = truth
@@ -373,12 +389,14 @@ class AutopilotCore:
         )
         self._gnss_error = _wander(self._gnss_error, s.gnss_m, s.gnss_time_s, dt_s, rng.standard_normal(3))
         self._walk = self._walk + s.velocity_walk * math.sqrt(dt_s) * rng.standard_normal(2)
+        self._walk = self._walk + self._acceleration * dt_s
+        self._climb = _wander(self._climb, s.climb_m_s, s.climb_time_s, dt_s, rng.standard_normal(1))
         self._baro += s.baro_walk_m * math.sqrt(dt_s) * float(rng.standard_normal())
         self._attitude = rotation.exp([*self._tilt, self._yaw + self._yaw_bias]) @ truth.ned_from_body
         self._rates = truth.rates_body_rad_s
         measured = self._distortion @ ((self._true_m - before)[:2] / dt_s) + self._walk
         self.filter.predict(boot_ns, measured, dt_s)
-        self._velocity = np.append(measured + self.filter.drift_m_s, truth.velocity_ned_m_s[2])
+        self._velocity = np.append(measured + self.filter.drift_m_s, truth.velocity_ned_m_s[2] + self._climb)
         if not self.gnss:
             if self._shadow is None:
                 self._shadow, self._shadow_drift = self.filter.position_m.copy(), self.filter.drift_m_s.copy()

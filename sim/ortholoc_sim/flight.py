@@ -61,6 +61,9 @@ _FIRST_FRAME_S = 2.5
 MIN_FIXED_FRACTION, MIN_FIXES = 0.7, 10
 MAX_FIX_ERROR_M, MAX_FIX_ERROR_DEG = 10.0, 5.0
 MAX_AUTOPILOT_ERROR_M = 10.0
+# Without these a flight passed on which the autopilot refused every fix and dead reckoning did well by itself.
+MIN_FUSED_FRACTION = 0.7
+MAX_ERROR_OF_DEAD_RECKONING = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +164,8 @@ class FlightReport:
         autopilot_error_m: horizontal error of the autopilot's position after.
         dead_reckoning_error_m: what it would have been without us.
         final_dead_reckoning_error_m: at the end.
-        vision: what the autopilot's filter did with what it received.
+        vision: what the autopilot's filter did with what it received. vision_after: of what it received after.
+        autopilot_stamps: how the autopilot had the time of a fix, see `FilterOptions.stamps`.
         problems: why `passed` is False, one line each.
     """
 
@@ -180,6 +184,8 @@ class FlightReport:
     dead_reckoning_error_m: Spread
     final_dead_reckoning_error_m: float | None
     vision: dict[str, int]
+    vision_after: dict[str, int]
+    autopilot_stamps: str
     autopilot_counts: dict[str, int]
     track: Track
     problems: tuple[str, ...]
@@ -511,6 +517,8 @@ def make_report(
     )
     known = reckoned[np.isfinite(reckoned)]
     vision = Counter(str(record.verdict) for record in loop.autopilot.vision)
+    lost_boot_ns = loop.boot_ns(lost_ns)
+    vision_after = Counter(str(r.verdict) for r in loop.autopilot.vision if r.arrival_ns >= lost_boot_ns)
     errors_after = [float(v) for v in autopilot[after]]
     return FlightReport(
         duration_s=(loop.now_ns - start_ns) / _S,
@@ -528,9 +536,16 @@ def make_report(
         dead_reckoning_error_m=Spread.of([float(v) for v in known]),
         final_dead_reckoning_error_m=float(known[-1]) if len(known) else None,
         vision={str(v): vision.get(str(v), 0) for v in Verdict},
+        vision_after=dict(vision_after),
+        autopilot_stamps=loop.autopilot.options.filter.stamps,
         autopilot_counts=dict(loop.autopilot.counts),
         track=track,
-        problems=tuple(_problems(frames_after, fixes_after, position, attitude, errors_after)),
+        problems=tuple(
+            [
+                *_problems(frames_after, fixes_after, position, attitude, errors_after),
+                *_no_use(fixes_after, vision_after, errors_after, known),
+            ]
+        ),
     )
 
 
@@ -554,6 +569,29 @@ def _problems(
             f"the autopilot's position was {max(autopilot):.1f} m off after GNSS was lost; limit "
             f"{MAX_AUTOPILOT_ERROR_M:.0f} m"
         )
+    return problems
+
+
+def _no_use(fixes_after: int, vision_after: Counter[str], autopilot: list[float], reckoned: FloatArray) -> list[str]:
+    """Whether the fixes were what held the autopilot's position."""
+    problems = []
+    # Of the fixes, not of what arrived: one that never got there was not fused either. The last may be under way.
+    fused = vision_after[Verdict.FUSED] + vision_after[Verdict.RESET]
+    if fixes_after and fused < MIN_FUSED_FRACTION * max(fixes_after - 1, 1):
+        refused = ", ".join(f"{n} {verdict}" for verdict, n in sorted(vision_after.items())) or "none arrived"
+        problems.append(
+            f"the autopilot took in {fused} of {fixes_after} fixes after GNSS was lost ({refused}); at least "
+            f"{MIN_FUSED_FRACTION:.0%} must"
+        )
+    if autopilot and len(reckoned):
+        # Median against median: drift grows as the square of time, so half of the time it is below a quarter of
+        # what it ends with, and a flight that got nothing at all would pass against the end.
+        median, alone = float(np.median(autopilot)), float(np.median(reckoned))
+        if median >= MAX_ERROR_OF_DEAD_RECKONING * alone:
+            problems.append(
+                f"the autopilot's median error was {median:.1f} m, dead reckoning alone gives {alone:.1f} m; under "
+                f"{MAX_ERROR_OF_DEAD_RECKONING:.0%} of that is wanted"
+            )
     return problems
 
 

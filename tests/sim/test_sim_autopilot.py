@@ -19,7 +19,7 @@ from ortholoc_sim.autopilot import (
     Verdict,
     position_sigma_m,
 )
-from ortholoc_sim.site import Site
+from ortholoc_sim.site import Geopoint, Site
 from ortholoc_sim.vehicle import Truth
 
 os.environ["MAVLINK20"] = "1"
@@ -30,7 +30,10 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 S = 1_000_000_000
 BOOT = 1000 * S
 OUR_OFFSET = 7_000 * S + 12_345  # the companion's clock minus boot time
-QUIET = SensorOptions(0.0, 15.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1e-6, 20.0, 0.0)
+QUIET = SensorOptions(
+    tilt_deg=0.0, yaw_bias_deg=0.0, yaw_deg=0.0, velocity_scale=0.0, velocity_turn_deg=0.0, velocity_walk=0.0,
+    acceleration_bias=0.0, climb_m_s=0.0, gnss_m=1e-6, baro_walk_m=0.0,
+)  # fmt: skip
 
 
 def truth(north: float = 0.0, east: float = 0.0, speed_north: float = 0.0) -> Truth:
@@ -258,6 +261,29 @@ def test_a_real_peer_gets_what_it_asks_for(site: Site, port: UdpPort) -> None:
     assert counts["LOCAL_POSITION_NED"] == pytest.approx(40, abs=3)
     assert counts["GLOBAL_POSITION_INT"] == pytest.approx(10, abs=2)
     assert got["GPS_RAW_INT"][0].fix_type == 3
+
+
+def test_velocity_is_not_the_truth_itself(site: Site) -> None:
+    core = AutopilotCore(AutopilotOptions(), site, truth())
+    climb = []
+    for i in range(3000):
+        core.step(BOOT + i * S // 100, truth(), 0.01)
+        climb.append(core.velocity_ned_m_s[2])
+    assert 0.03 < np.std(climb) < 0.4
+
+
+def test_receiver_tells_its_own_position(site: Site) -> None:
+    """Of the receiver, with its error, wherever the filter believes itself to be."""
+    core = AutopilotCore(AutopilotOptions(streams_by_default=True), site, truth())
+    core.filter.offset_m += 300.0
+    sent = core.step(BOOT, truth(), 0.01)
+    raw = next(m for m in sent if m.get_type() == "GPS_RAW_INT")
+    point = Geopoint(raw.lat / 1e7, raw.lon / 1e7, raw.alt / 1e3)
+    off = site.autopilot_from_geopoint(point) - core.true_position_m
+    assert 0.05 < np.linalg.norm(off) < 4.0
+    assert raw.h_acc >= 300
+    assert raw.v_acc > 0
+    assert raw.time_usec == BOOT // 1000
 
 
 def test_no_fix_after_gnss_is_lost(site: Site) -> None:
