@@ -114,9 +114,11 @@ def sample_store(sample: sequence.Sample) -> Iterator[MapStore]:
         folder = Path(name)
         grid = sample.grid
         transform = Affine(grid.dx, 0.0, grid.west, 0.0, grid.dy, grid.top)
+        # Named after the sample, for the builder's messages name files.
+        dop, dsm = folder / f"{sample.name} image_dop.tif", folder / f"{sample.name} dsm.tif"
         for file, bands, dtype in (
-            ("dop.tif", np.moveaxis(sample.dop, 2, 0), "uint8"),
-            ("dsm.tif", sample.dsm[None], "float32"),
+            (dop, np.moveaxis(sample.dop, 2, 0), "uint8"),
+            (dsm, sample.dsm[None], "float32"),
         ):
             profile = {
                 "driver": "GTiff",
@@ -128,11 +130,11 @@ def sample_store(sample: sequence.Sample) -> Iterator[MapStore]:
                 "nodata": np.nan if dtype == "float32" else None,
             }
             try:
-                with rasterio.open(folder / file, "w", **profile) as target:
+                with rasterio.open(file, "w", **profile) as target:
                     target.write(bands)
             except rasterio.errors.RasterioError as err:
-                raise MapError(f"{sample.name}: can't write {folder / file} ({err}); is the disk full?") from err
-        pack = build_pack(folder / "dop.tif", folder / "dsm.tif", folder / "pack", PackOptions(quality=95))
+                raise MapError(f"{sample.name}: can't write {file} ({err}); is the disk full?") from err
+        pack = build_pack(dop, dsm, folder / "pack", PackOptions(quality=95))
         with MapStore(pack) as store:
             yield store
 
