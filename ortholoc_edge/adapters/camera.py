@@ -154,13 +154,26 @@ def read_image(path: Path) -> ImageArray:
             defect = f"OpenCV can't decode it ({error.err})"
         else:
             if image is not None and image.size > 0:
-                return _frozen(image)
+                return _frozen(image, f"picture {path}")
             defect = "not a picture that OpenCV can decode"
     raise CameraError(f"picture {path} is unusable: {defect}; copy it again from its source or take it out")
 
 
-def _frozen(image: Any) -> ImageArray:
-    array: ImageArray = np.ascontiguousarray(image, dtype=np.uint8)
+def _rgb(image: Any, name: str) -> ImageArray:
+    """What OpenCV captured, as RGB. Raises: CameraError naming the source."""
+    if image.ndim == 2 or image.shape[2] == 1:
+        return _frozen(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), name)
+    return _frozen(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), name)
+
+
+def _frozen(image: Any, name: str) -> ImageArray:
+    # numpy would wrap a 16-bit 300 to 44 without a word.
+    if image.dtype != np.uint8:
+        raise CameraError(
+            f"{name} gives {image.dtype} pixels, not uint8; convert them before, in a GStreamer pipeline by "
+            "'videoconvert ! video/x-raw,format=BGR'"
+        )
+    array: ImageArray = np.ascontiguousarray(image)
     array.flags.writeable = False
     return array
 
@@ -349,7 +362,7 @@ class VideoSource:
     def _retrieve(self) -> ImageArray | None:
         with self._lock:
             good, image = (False, None) if self._closed.is_set() else self._capture.retrieve()
-        return _frozen(cv2.cvtColor(image, cv2.COLOR_BGR2RGB)) if good and image is not None else None
+        return _rgb(image, f"video {self._path}") if good and image is not None else None
 
     def _report_end(self) -> None:
         promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
@@ -420,6 +433,8 @@ class DeviceSource:
             )
             if self._stop.is_set():
                 raise EndOfFrames
+            if isinstance(self._failure, CameraError):
+                raise CameraError(str(self._failure)) from self._failure
             if self._failure is not None:
                 raise CameraError(f"camera {self._device}: its thread ended; see the log") from self._failure
             frame, self._latest = self._latest, None
@@ -510,7 +525,7 @@ class DeviceSource:
                 self.failed_grabs += 1
                 continue
             failed = 0
-            frame = Frame(stamp_ns, _frozen(cv2.cvtColor(image, cv2.COLOR_BGR2RGB)), str(self._number))
+            frame = Frame(stamp_ns, _rgb(image, f"camera {self._device}"), str(self._number))
             self._number += 1
             with self._condition:
                 self.overwritten += self._latest is not None

@@ -172,11 +172,21 @@ class Endpoint:
     port: int
 
 
+def _is_host(text: str) -> bool:
+    """Whether the socket module would take it for a name to look up: it raises UnicodeError for others."""
+    try:
+        text.strip("[]").encode("idna")
+    except UnicodeError:
+        return False
+    return not any(c.isspace() or c == "\0" for c in text)
+
+
 def parse_endpoint(text: str) -> Endpoint:
     """Read ``LinkOptions.endpoint``. Raises: ConfigError that names the text and what is accepted."""
     match = re.fullmatch(r"(udp|udpout|tcp|serial):(.+):(\d{1,8})", text)
     number = int(match[3]) if match else 0
-    if match is None or (match[1] != "serial" and not 0 < number <= 65535) or number == 0:
+    network = match is not None and match[1] != "serial"
+    if match is None or number == 0 or (network and (number > 65535 or not _is_host(match[2]))):
         raise ConfigError(
             f"link endpoint {text!r} can't be used; write udp:HOST:PORT (listen), udpout:HOST:PORT, "
             "tcp:HOST:PORT or serial:/dev/ttyX:BAUD"
@@ -708,9 +718,24 @@ class LinkProtocol:
             and self._options.system_id in (0, message.get_srcSystem())
         )
 
+    def _is_another_autopilot(self, message: MavlinkMessage) -> bool:
+        return (
+            message.autopilot in _AUTOPILOTS
+            and message.type != dialect.MAV_TYPE_GCS
+            and self._options.system_id not in (0, message.get_srcSystem())
+        )
+
     def _on_heartbeat(self, message: MavlinkMessage, system: int, arrival_ns: int) -> None:
         if not self.is_vehicle_heartbeat(message):
             self.counts["ignored"] += 1
+            if self._vehicle is None and self._is_another_autopilot(message):
+                self._log(
+                    arrival_ns,
+                    logging.WARNING,
+                    "other_system",
+                    f"an autopilot with system id {system} is heard, but [link] system_id is "
+                    f"{self._options.system_id}, of which nothing came; set it to {system}, or to 0 to take the first",
+                )
             return
         self.counts["received.HEARTBEAT"] += 1
         said = _AUTOPILOTS[message.autopilot]

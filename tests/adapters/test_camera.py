@@ -14,6 +14,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from ortholoc_edge.adapters import camera
 from ortholoc_edge.adapters.camera import (
     BadFrameError,
     CameraOptions,
@@ -389,3 +390,12 @@ def test_gstreamer_absent_from_this_opencv_is_said():
 def test_options_are_strict(document):
     with pytest.raises(msgspec.ValidationError):
         msgspec.convert(document, CameraOptions)
+
+
+def test_pixels_that_are_not_8_bit_are_refused_by_name():
+    with pytest.raises(CameraError, match=r"camera x gives uint16"):
+        camera._rgb(np.full((4, 4, 3), 300, np.uint16), "camera x")
+    with pytest.raises(CameraError, match=r"camera x gives uint16"):
+        camera._rgb(np.full((4, 4), 300, np.uint16), "camera x")
+    grey = camera._rgb(np.full((4, 4), 30, np.uint8), "camera x")
+    assert grey.shape == (4, 4, 3) and (grey == 30).all() and not grey.flags.writeable

@@ -218,6 +218,22 @@ def test_ground_station_and_others_are_not_autopilots():
     assert script.protocol.vehicle.system_id == 3 and script.protocol.counts["other_vehicles"] == 1
 
 
+def test_other_system_id_than_configured_is_said(caplog):
+    script = Script(system_id=5)
+    for _ in range(8):
+        script.now += S
+        script.hear(heartbeat(), system=7)
+        script.hear(heartbeat(8, kind=6), system=255, component=190)
+    assert script.protocol.vehicle is None
+    (line,) = [r.getMessage() for r in caplog.records]
+    assert "system id 7" in line and "system_id is 5" in line
+    caplog.clear()
+    script.hear(heartbeat(), system=5)
+    script.now += 20 * S
+    script.hear(heartbeat(), system=7)
+    assert not [r for r in caplog.records if r.levelname == "WARNING"]
+
+
 def test_own_heartbeat_and_requests():
     script = Script()
     script.protocol.system_status = SystemStatus.CRITICAL
@@ -696,8 +712,11 @@ def test_no_content_raises(items):
 
 @pytest.mark.parametrize(
     "text",
-    ["", "udp:14550", "udp:0.0.0.0:0", "tcp:h:70000", "/dev/ttyS0", "serial:/dev/ttyS0", "usb:a:1", "udp::5"],
-)
+    [
+        "", "udp:14550", "udp:0.0.0.0:0", "tcp:h:70000", "/dev/ttyS0", "serial:/dev/ttyS0", "usb:a:1", "udp::5",
+        "udp:a..b:14550", f"tcp:{'x' * 70}.local:5760", "udpout:a b:5",
+    ],
+)  # fmt: skip
 def test_unusable_endpoint_is_a_config_error(text):
     with pytest.raises(ConfigError, match="link endpoint"):
         AutopilotLink(LinkOptions(endpoint=text), SystemClock())
