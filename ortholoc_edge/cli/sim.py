@@ -101,6 +101,7 @@ def _table(report: FlightReport, args: argparse.Namespace) -> str:
         ("latency from exposure", spread(report.latency_ms, "ms")),
         ("autopilot error", spread(report.autopilot_error_m, "m, horizontal, after GNSS was lost")),
         ("dead reckoning alone", "-" if end is None else f"{end:.1f} m off at the end"),
+        ("time of a fix", f"{report.autopilot_stamps} (see ortholoc_sim.autopilot.FilterOptions)"),
         ("autopilot's filter", ", ".join(f"{verdict} {count}" for verdict, count in report.vision.items() if count)),
         ("pictures", f"{args.out / 'track.png'}, figures in {args.out / 'summary.json'}"),
         ("result", "localized without GNSS" if report.passed else "FAILED: " + "; ".join(report.problems)),

@@ -38,6 +38,7 @@ from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
+from ortholoc_edge.pipeline.navigator import TimingOptions
 from ortholoc_edge.pipeline.outcome import Fix, Outcome
 from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.store import MapStore
@@ -77,7 +78,8 @@ class FlightOptions:
         frame_rate_hz: of the camera.
         camera, mount: the one on board.
         seed: of sensor errors, wind and noise.
-        matcher, localizer: of the daemon.
+        matcher, localizer, timing: of the daemon. Fixes may be older than its default allows: the simulated autopilot
+            applies them where their stamps say, and a busy computer draws the camera's pictures too.
     """
 
     pack: Path | None = None
@@ -103,6 +105,7 @@ class FlightOptions:
     seed: int = 1
     matcher: MatcherOptions = field(default_factory=MatcherOptions)
     localizer: LocalizerOptions = field(default_factory=LocalizerOptions)
+    timing: TimingOptions = field(default_factory=lambda: TimingOptions(max_age_ms=5000.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -321,7 +324,9 @@ class SimulatedCamera:
 # -- the flight --------------------------------------------------------------
 
 
-def daemon_under_test(matcher: MatcherOptions, localizer: LocalizerOptions) -> UnderTest:
+def daemon_under_test(
+    matcher: MatcherOptions, localizer: LocalizerOptions, timing: TimingOptions
+) -> UnderTest:
     """The real daemon, in this process, configured for the bench's camera, pack and autopilot."""
 
     def prepare(bench: Bench) -> Callable[[], None]:
@@ -337,6 +342,7 @@ def daemon_under_test(matcher: MatcherOptions, localizer: LocalizerOptions) -> U
             mount=bench.mount,
             matcher=matcher,
             localizer=localizer,
+            timing=timing,
         )  # fmt: skip
         daemon = Daemon(config, frames=bench.frames, on_outcome=lambda _, outcome: bench.on_outcome(outcome))
         return lambda: daemon.run(bench.stop)
@@ -377,7 +383,7 @@ def run_flight(options: FlightOptions, under_test: UnderTest | None = None, cloc
     port = UdpPort(options.autopilot.system_id)
     try:
         # The world is made in the camera's process meanwhile.
-        run = (under_test or daemon_under_test(options.matcher, options.localizer))(
+        run = (under_test or daemon_under_test(options.matcher, options.localizer, options.timing))(
             Bench(
                 path, options.camera, options.mount, camera, f"udpout:127.0.0.1:{port.port}", stop,
                 lambda outcome: outcomes.append((clock.now_ns(), outcome)),
