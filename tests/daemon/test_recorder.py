@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import resource
 import signal
@@ -70,30 +71,34 @@ def test_rotation_keeps_the_last_and_the_limit(tmp_path: Path) -> None:
     assert recorder.dropped == 0
 
 
-@pytest.fixture
-def full_disk() -> Iterator[Callable[[int], None]]:
-    """Files can't grow beyond a limit: EFBIG, as ENOSPC of a full disk, from the same call."""
+@contextlib.contextmanager
+def full_disk(limit_bytes: int) -> Iterator[None]:
+    """Files can't grow beyond a limit: EFBIG, as ENOSPC of a full disk, from the same call.
+
+    Not a fixture: the limit holds for the whole process, and a test runner whose output goes to a file reports
+    before fixtures end.
+    """
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    yield lambda limit: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    signal.signal(signal.SIGXFSZ, handler)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
 
 
-def test_full_disk_drops_and_counts_and_recovers(
-    tmp_path: Path, full_disk: Callable[[int], None], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_full_disk_drops_and_counts_and_recovers(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     recorder = Recorder(tmp_path, 64)
     for stamp_ns in range(5):
         recorder.put(None, outcome(stamp_ns))
     path = tmp_path / FILE_NAME
     wait_for(lambda: path.stat().st_size > 0 and recorder._queue.empty())
     wait_for(lambda: path.read_bytes().count(b"\n") == 5)
-    full_disk(path.stat().st_size + 10)
-    for stamp_ns in range(5, 15):
-        recorder.put(None, outcome(stamp_ns))
-    wait_for(lambda: recorder.dropped == 10)
-    full_disk(resource.RLIM_INFINITY)
+    with full_disk(path.stat().st_size + 10):
+        for stamp_ns in range(5, 15):
+            recorder.put(None, outcome(stamp_ns))
+        wait_for(lambda: recorder.dropped == 10)
     for stamp_ns in range(15, 20):
         recorder.put(None, outcome(stamp_ns))
     recorder.close()
@@ -112,12 +117,12 @@ def test_full_disk_drops_and_counts_and_recovers(
     assert set(range(15, 20)) <= set(whole), "what came after the disk had room again is there, each on its line"
 
 
-def test_close_on_a_full_disk_does_not_raise(tmp_path: Path, full_disk: Callable[[int], None]) -> None:
+def test_close_on_a_full_disk_does_not_raise(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path, 64)
-    full_disk(10)
-    recorder.put(None, outcome(1))
-    wait_for(lambda: recorder.dropped == 1)
-    recorder.close()
+    with full_disk(10):
+        recorder.put(None, outcome(1))
+        wait_for(lambda: recorder.dropped == 1)
+        recorder.close()
 
 
 def test_slow_disk_drops_and_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
