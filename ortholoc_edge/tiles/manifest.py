@@ -263,22 +263,27 @@ def read_manifest(path: Path) -> Manifest:
 
     Raises: MapError naming the file, the key and the remedy.
     """
+    return parse_manifest(manifest_bytes(path), path)
+
+
+def manifest_bytes(path: Path) -> bytes:
+    """A manifest as it is on disk, which is what a signature is over. Raises: MapError if it cannot be read."""
     try:
-        raw = path.read_bytes()
+        return path.read_bytes()
     except FileNotFoundError as err:
         raise MapError(
             f"{path.parent}: no area pack, {path.name} is missing; build one with: ortholoc-edge tiles build"
         ) from err
     except OSError as err:
-        raise MapError(
-            f"{path}: cannot be read ({err.strerror}); check the path and its permissions"
-        ) from err
+        raise MapError(f"{path}: cannot be read ({err.strerror}); check the path and its permissions") from err
+
+
+def parse_manifest(raw: bytes, path: Path) -> Manifest:
+    """Check the bytes of a manifest; ``path`` is for messages. Raises: MapError naming file, key and remedy."""
     # The head first: a newer format would fail on keys, and the version is the better message.
     head = _decoded(raw, _Head, path)
     if head.format != FORMAT:
-        raise MapError(
-            f"{path}: format {head.format!r} at $.format, expected {FORMAT!r}; is it an area pack?"
-        )
+        raise MapError(f"{path}: format {head.format!r} at $.format, expected {FORMAT!r}; is it an area pack?")
     if head.version != VERSION:
         raise MapError(
             f"{path}: version {head.version} at $.version, this program reads {VERSION};"
