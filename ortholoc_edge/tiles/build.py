@@ -1,4 +1,4 @@
-"""Two rasters to an area pack: two COGs and a manifest, complete or not there at all."""
+"""Any mix of public geodata to an area pack, complete or not there at all."""
 
 from __future__ import annotations
 
@@ -6,109 +6,121 @@ import hashlib
 import logging
 import os
 import re
-import secrets
 import shutil
-import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
 
+import msgspec
 import numpy as np
-import numpy.typing as npt
-import pyproj
-import rasterio
-import rasterio.shutil
-from pyproj.exceptions import CRSError
-from rasterio.enums import ColorInterp, Resampling
-from rasterio.errors import RasterioError
-from rasterio.windows import Window
 
 from ortholoc_edge.errors import ConfigError, MapError
-from ortholoc_edge.geometry.grid import RasterGrid
-from ortholoc_edge.tiles.cog import BLOCK_PX, Cog, block_cache, quiet_georeference, raster_grid
-from ortholoc_edge.tiles.collar import Collar, windows
+from ortholoc_edge.tiles import alignment, coverage, encode, features, matchability, stac, vrt
+from ortholoc_edge.tiles.area import Area
+from ortholoc_edge.tiles.budget import Estimate, Sampler, Settings, settings_within
+from ortholoc_edge.tiles.cog import block_cache
+from ortholoc_edge.tiles.features import PER_MPX
 from ortholoc_edge.tiles.georeference import (
     Georeference,
     VerticalDatum,
     VerticalKind,
     datum_shift_caveat,
+    derive_offsets,
     derive_vertical,
-    projected_crs,
-    vertical_of,
 )
+from ortholoc_edge.tiles.install import install, work_folder
+from ortholoc_edge.tiles.lattice import CROP_PX, Lattice, PixelBox
 from ortholoc_edge.tiles.manifest import (
     FORMAT,
     MANIFEST_NAME,
     VERSION,
+    Alignment,
     Dop,
+    DopTile,
     Dsm,
-    Grid,
+    DsmTile,
+    FeatureLayer,
+    FeatureTile,
+    FileNote,
     Manifest,
-    encode_crcs,
+    SourceNote,
+    layer_box,
     write_manifest,
 )
 from ortholoc_edge.tiles.pack import Pack
+from ortholoc_edge.tiles.plan import LayerPlan, Plan, lat_lon_of, make_plan, named_vertical
+from ortholoc_edge.tiles.sources import Source, discover, with_common_stretch
+from ortholoc_edge.tiles.store import MapStore
+from ortholoc_edge.tiles.tasks import (
+    DopJob,
+    DsmJob,
+    FeatureJob,
+    Job,
+    PrepareJob,
+    Record,
+    finished,
+    job_name,
+    run_all,
+    write_file,
+)
 
 logger = logging.getLogger(__name__)
 
 Progress = Callable[[float, str], None]
 
-NODATA = -9999.0
-_DOP_NAME, _DSM_NAME = "dop.tif", "dsm.tif"
-
-# Values that programs write for "no data" and people forget to declare (-32768 and -32767 of int16 rasters,
-# the lowest and highest float32).
-_SENTINELS = (-9999.0, -32767.0, -32768.0)
-_SENTINEL_MAGNITUDE = 1e30
-# The Dead Sea's shore lies at -430 m, Everest at 8849 m.
-_MIN_HEIGHT_M, _MAX_HEIGHT_M = -500.0, 9000.0
-# Of the cells with data: up to here heights beyond these are spikes, from here on the file is not understood.
-_MAX_SPIKE_SHARE = 0.01
-
-# Zeros from the border inward are fill where hardly any (1 %) of the other heights come near zero.
-_FILL_DISTANCE_M = 50.0
-_MAX_NEAR_FILL_SHARE = 0.01
-# Black from the border inward is fill from this share of the orthophoto on; less may be a shadow or a lake.
-_MIN_BLACK_SHARE = 0.005
-
 # LERC's error should vanish beside the DSM's own: 2 cm, less for the finer grids of low flights.
 _MAX_Z_ERROR_M = 0.02
 _MAX_Z_ERROR_PER_GSD = 1.0 / 20.0
 
-# GDAL takes 5 % of the machine's memory by default.
 _BUILD_CACHE_BYTES = 256 * 2**20
-
-_SPARSE_COVERAGE = 0.5
-
-# Of the full-resolution cells below a cell of an overview, what must have data for it to have any.
-_MIN_VALID_SHARE = 0.75
+# Tiles that the check of DOP against DSM looks at: enough for a consensus, and memory that does not grow with the
+# area.
+_MAX_CHECKED_TILES = 24
+# A size budget that was missed is tried again at lower quality, this often.
+_MAX_TRIALS = 4
 
 
 @dataclass(frozen=True, slots=True)
 class PackOptions:
-    """How to build, and what the rasters do not say about themselves.
+    """How to build, and what the sources do not say about themselves.
 
     Attributes:
-        dop_compression, quality: of the DOP, lossy; quality 1-100.
+        dop_compression, quality: of the DOP; quality 1-100, WEBP is lossless at 100.
         max_z_error_m: of the DSM's compression; None: the lower of 2 cm and a twentieth of its GSD.
-        vertical: what heights are measured from; None: what the DSM's CRS says, else "unknown".
+        dop_gsd_m, dsm_gsd_m: pixel sizes of the pack; None: those of the sources.
+        max_size_bytes: of the whole pack; quality, then pixel sizes give way. None: no limit.
+        area: what to keep; None: everything.
+        source_crs: of sources that do not say it.
+        pack_crs: of the pack; None: that of most of the orthophoto.
+        max_hole_cells: largest hole of the DSM that is closed, where its rim is a plane; 0: none.
+        features: matcher whose features of the DOP are precomputed; None: none.
+        features_per_mpx: how many are kept per million pixels of each level.
+        vertical: what heights are measured from; None: what the DSM's CRS says.
         vertical_epsg: vertical system of orthometric heights.
         geoid_undulation_m: height of the geoid above the ellipsoid in the area.
-        dop_date, dsm_date: of acquisition: 2023, 2023-06 or 2023-06-04.
+        dop_date, dsm_date: of acquisition, instead of what the sources say: 2023, 2023-06 or 2023-06-04.
         attribution, licence: of the sources.
         true_ortho: whether the DOP is one; None: not known.
         dop_sigma_m, dsm_sigma_m: planimetric and vertical error of the sources, 1 sigma.
         force: replace a pack at the output path.
-        created: what to write as the time of the build, UTC; None: now.
+        created: what to write as the time of the build, UTC; None: nothing, so that equal input gives equal bytes.
     Raises: ConfigError for a value out of range.
     """
 
-    dop_compression: Literal["webp", "jpeg"] = "webp"
-    quality: int = 85
+    dop_compression: encode.Compression = "webp"
+    quality: int = 75
     max_z_error_m: float | None = None
+    dop_gsd_m: float | None = None
+    dsm_gsd_m: float | None = None
+    max_size_bytes: int | None = None
+    area: Area | None = None
+    source_crs: str | None = None
+    pack_crs: str | None = None
+    max_hole_cells: int = 16
+    features: str | None = None
+    features_per_mpx: float = PER_MPX
     vertical: VerticalKind | None = None
     vertical_epsg: int | None = None
     geoid_undulation_m: float | None = None
@@ -127,6 +139,12 @@ class PackOptions:
             raise ConfigError(f"quality {self.quality}: must lie between 1 and 100")
         if self.max_z_error_m is not None and not 0 < self.max_z_error_m <= 1:
             raise ConfigError(f"max_z_error_m {self.max_z_error_m}: must lie between 0 (exclusive) and 1 m")
+        if self.max_size_bytes is not None and self.max_size_bytes < 1:
+            raise ConfigError(f"max_size_bytes {self.max_size_bytes}: must be positive")
+        if not (np.isfinite(self.features_per_mpx) and self.features_per_mpx > 0):
+            raise ConfigError(f"features_per_mpx {self.features_per_mpx}: must be positive")
+        if self.max_hole_cells < 0:
+            raise ConfigError(f"max_hole_cells {self.max_hole_cells}: must be 0 or more")
         for name in ("dop_sigma_m", "dsm_sigma_m"):
             sigma = getattr(self, name)
             if sigma is not None and not (np.isfinite(sigma) and sigma >= 0):
@@ -137,79 +155,107 @@ class PackOptions:
                 raise ConfigError(f"{name} {date!r}: write it as 2023, 2023-06 or 2023-06-04")
 
 
-class _Source(NamedTuple):
-    """An opened raster that passed the checks common to both."""
+@dataclass(frozen=True, slots=True)
+class Workers:
+    """Where a build runs: ``processes`` of this machine, or the Dask cluster at ``dask``."""
 
-    dataset: Any
-    path: Path
-    grid: RasterGrid
-    crs: str | None
-    """As in the file: a compound system names the heights, too."""
+    processes: int = 1
+    dask: str | None = None
 
 
-class _Written(NamedTuple):
-    grid: RasterGrid
-    levels: int
-    valid_fraction: float
-    sha256: str
-    size: int
-    crcs: list[int]
+@dataclass(frozen=True, slots=True)
+class Preview:
+    """What a build would do: for the dry run."""
+
+    plan: Plan
+    settings: Settings
+    estimate: Estimate
 
 
 def build_pack(
-    dop: Path,
-    dsm: Path,
+    dop: Path | Sequence[Path],
+    dsm: Path | Sequence[Path],
     out: Path,
     options: PackOptions | None = None,
     progress: Progress | None = None,
+    workers: Workers | None = None,
 ) -> Pack:
-    """Build an area pack from one orthophoto and one surface model.
+    """Build an area pack from orthophotos and surface models.
 
-    Both keep their own grids. The pack is written to a directory beside ``out``, checked, and renamed;
-    whatever happens before, ``out`` is as it was. Replacing a pack (``options.force``) takes two renames, so
-    a power cut between them leaves the old pack under a hidden name beside ``out``.
+    The work is done in a hidden folder beside ``out``, where a build that was cut off is taken up again; only a
+    complete and checked pack takes the name ``out``, in one step.
+
     Args:
-        dop, dsm: rasters that GDAL reads, in one projected CRS in metres, or both without CRS (local metres).
-        out: directory of the pack.
+        dop, dsm: files and folders; see `sources.discover`.
+        out: folder of the pack.
         progress: called with a fraction 0-1 and what is being done.
-    Raises: MapError for unusable rasters and failed writes; ConfigError for options that contradict each other.
+    Raises: MapError for unusable sources and failed writes; ConfigError for options that contradict each other.
     """
-    options = options or PackOptions()
+    options, workers = options or PackOptions(), workers or Workers()
     say = progress or _silent
+    dop, dsm = _paths(dop), _paths(dsm)
     out = out.resolve()
-    _check_output(out, (dop, dsm), options.force)
-    say(0.0, "checking rasters")
-    with block_cache(_BUILD_CACHE_BYTES), _opened(dop) as dop_source, _opened(dsm) as dsm_source:
-        _check_dop(dop_source)
-        _check_dsm(dsm_source)
-        crs = _common_crs(dop_source, dsm_source)
-        _check_overlap(dop_source, dsm_source)
-        anchor = _anchor(dop_source.grid)
-        georeference = Georeference(crs, _vertical(options, crs, anchor, dsm_source), anchor)
-        with _staging(out) as staged:
-            manifest = _write(dop_source, dsm_source, staged, georeference=georeference, options=options, say=say)
-            write_manifest(manifest, staged / MANIFEST_NAME)
-            say(0.9, "checking the pack")
-            problems = Pack.open(staged).verify()
-            if problems:
-                raise MapError(
-                    f"{out}: what was written does not read back ({problems[0]}); check the disk and build again"
-                )
-            for path in (*staged.iterdir(), staged):
-                _fsync(path)
-            _install(staged, out)
+    _check_output(out, (*dop, *dsm), options.force)
+    say(0.0, "looking at the sources")
+    with block_cache(_BUILD_CACHE_BYTES):
+        layers = _discovered(dop, dsm, options)
+        _vertical_kind(options, layers[1])
+        model_sha256 = None if options.features is None else features.model_of(options.features)
+        with _explained(out), work_folder(out) as folder:
+            plan, settings = _settled(layers, options, folder)
+            for trial in range(_MAX_TRIALS):
+                staged = _Build(plan, settings, options, model_sha256, folder, workers, say).run()
+                size = sum(path.stat().st_size for path in staged.rglob("*") if path.is_file())
+                limit = options.max_size_bytes
+                if limit is None or size <= limit:
+                    break
+                if trial == _MAX_TRIALS - 1 or settings.quality <= 10:
+                    raise MapError(
+                        f"{out}: {size / 1e6:.1f} MB at quality {settings.quality}, more than --max-size allows;"
+                        " give it a smaller --area or --dop-gsd a coarser value"
+                    )
+                # Bytes of a lossy picture fall somewhat slower than its quality number.
+                lower = int(settings.quality * (limit / size) ** 1.5)
+                settings = replace(settings, quality=max(min(lower, settings.quality - 3), 10))
+                logger.info("%s: %.1f MB is too much; again at quality %d", out, size / 1e6, settings.quality)
+            install(staged, out)
     say(1.0, "done")
     return Pack.open(out)
+
+
+def preview_build(
+    dop: Path | Sequence[Path], dsm: Path | Sequence[Path], out: Path, options: PackOptions
+) -> Preview:
+    """What `build_pack` would do, and how large the pack would be. Leaves nothing behind.
+
+    Raises: as `build_pack`.
+    """
+    out = out.resolve()
+    _check_output(out, (*_paths(dop), *_paths(dsm)), options.force)
+    with block_cache(_BUILD_CACHE_BYTES), _explained(out):
+        layers = _discovered(_paths(dop), _paths(dsm), options)
+        _vertical_kind(options, layers[1])
+        with work_folder(out) as folder:
+            plan = _planned(layers, options)
+            sampler = Sampler(plan, folder)
+            settings = _settings(plan, options)
+            if options.max_size_bytes is not None:
+                return Preview(plan, *settings_within(sampler, settings, options.max_size_bytes))
+            return Preview(plan, settings, sampler.estimate(settings))
 
 
 def _silent(fraction: float, message: str) -> None:
     pass
 
 
-def _check_output(out: Path, sources: tuple[Path, ...], force: bool) -> None:
+def _paths(given: Path | Sequence[Path]) -> tuple[Path, ...]:
+    return (given,) if isinstance(given, Path) else tuple(given)
+
+
+def _check_output(out: Path, sources: Sequence[Path], force: bool) -> None:
     for source in sources:
-        if source.resolve().is_relative_to(out):
-            raise MapError(f"{out}: contains the source {source.name}; choose another output directory")
+        if source.resolve().is_relative_to(out) or out.is_relative_to(source.resolve()):
+            raise MapError(f"{out}: contains the source {source.name} or lies in it; choose another output directory")
     if not out.exists():
         return
     if not force:
@@ -220,502 +266,461 @@ def _check_output(out: Path, sources: tuple[Path, ...], force: bool) -> None:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[_Source]:
+def _explained(out: Path) -> Iterator[None]:
     try:
-        with quiet_georeference():
-            dataset = rasterio.open(path)
-    except (RasterioError, OSError) as err:
-        raise MapError(f"{path}: cannot be opened ({err}); give a raster that gdalinfo can read") from err
-    with dataset:
-        grid = raster_grid(dataset, path)
-        crs = None
-        if dataset.crs is not None:
-            crs = dataset.crs.to_wkt()
-            projected_crs(crs, str(path))
-        elif grid.gsd_m < 1e-4:
-            raise MapError(
-                f"{path}: no CRS and pixels of {grid.gsd_m:.2g}, which looks like degrees;"
-                " reproject with: gdalwarp -s_srs EPSG:4326 -t_srs EPSG:326ZZ"
+        yield
+    except OSError as err:
+        where = out.parent if out.parent.exists() else Path("/")
+        free_mb = shutil.disk_usage(where).free / 1e6
+        raise MapError(
+            f"{out}: cannot be written ({err}; {free_mb:.0f} MB free); check free space and permissions"
+        ) from err
+
+
+def _discovered(
+    dop: Sequence[Path], dsm: Sequence[Path], options: PackOptions
+) -> tuple[list[Source], list[Source]]:
+    pictures = discover(dop, "dop", assign_crs=options.source_crs, date=options.dop_date)
+    heights = discover(dsm, "dsm", assign_crs=options.source_crs, date=options.dsm_date)
+    return with_common_stretch(pictures), heights
+
+
+def _planned(layers: tuple[list[Source], list[Source]], options: PackOptions) -> Plan:
+    return make_plan(
+        *layers,
+        pack_crs=options.pack_crs,
+        dop_gsd_m=options.dop_gsd_m,
+        dsm_gsd_m=options.dsm_gsd_m,
+        area=options.area,
+    )
+
+
+def _settings(plan: Plan, options: PackOptions) -> Settings:
+    dsm_gsd_m = plan.dsm.lattice.pixel_m
+    max_z_error_m = options.max_z_error_m or min(_MAX_Z_ERROR_M, round(dsm_gsd_m * _MAX_Z_ERROR_PER_GSD, 6))
+    return Settings(
+        dop_gsd_m=plan.dop.lattice.pixel_m,
+        dsm_gsd_m=dsm_gsd_m,
+        compression=options.dop_compression,
+        quality=options.quality,
+        max_z_error_m=max_z_error_m,
+        features_per_mpx=0.0 if options.features is None else options.features_per_mpx,
+    )
+
+
+def _settled(
+    layers: tuple[list[Source], list[Source]], options: PackOptions, folder: Path
+) -> tuple[Plan, Settings]:
+    """The plan, at pixel sizes and quality that fit the size budget."""
+    plan = _planned(layers, options)
+    settings = _settings(plan, options)
+    if options.max_size_bytes is None:
+        return plan, settings
+    settings, estimate = settings_within(Sampler(plan, folder), settings, options.max_size_bytes)
+    logger.info(
+        "for %.0f MB: DOP %.3g m/px at quality %d, DSM %.3g m/px within %.3g m, about %.1f MB",
+        options.max_size_bytes / 1e6,
+        settings.dop_gsd_m,
+        settings.quality,
+        settings.dsm_gsd_m,
+        settings.max_z_error_m,
+        estimate.bytes / 1e6,
+    )
+    fitted = replace(options, dop_gsd_m=settings.dop_gsd_m, dsm_gsd_m=settings.dsm_gsd_m)
+    return _planned(layers, fitted), settings
+
+
+def _vertical_kind(options: PackOptions, dsm: Sequence[Source]) -> tuple[VerticalKind, int | None]:
+    """Kind and EPSG code of the heights, by the options or the sources.
+
+    Raises: ConfigError if neither says it: a silent mix-up is an altitude error of 30 to 50 m.
+    """
+    kind, epsg = options.vertical, options.vertical_epsg
+    named = named_vertical(dsm)
+    if kind is None and named is None:
+        raise ConfigError(
+            f"{dsm[0].name}: its CRS does not say what heights are measured from; say it with --vertical orthometric"
+            " [--vertical-epsg 7837], --vertical ellipsoid --geoid-undulation-m METRES, or, if nobody knows and no"
+            " autopilot will use the pack, --vertical unknown"
+        )
+    if kind is None:
+        assert named is not None, "checked"
+        return named[0], epsg if epsg is not None else named[1]
+    if named is not None and kind != named[0]:
+        logger.warning("%s: its CRS says %s heights, --vertical %s is taken", dsm[0].name, named[0], kind)
+    elif named is not None and epsg is None:
+        epsg = named[1]
+    return kind, epsg
+
+
+class _Build:
+    """One build at given settings: from a plan to a staged pack."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        settings: Settings,
+        options: PackOptions,
+        model_sha256: str | None,
+        folder: Path,
+        workers: Workers,
+        say: Progress,
+    ) -> None:
+        self._plan = plan
+        self._settings = settings
+        self._options = options
+        self._model_sha256 = model_sha256
+        self._work = folder / "work"
+        self._staged = folder / "pack"
+        self._workers = workers
+        self._say = say
+        self._files: list[FileNote] = []
+
+    def run(self) -> Path:
+        """Returns: the folder of the complete pack, checked."""
+        self._work.mkdir(exist_ok=True)
+        # A pack that was staged before a kill may be an old one, exchanged out of its place.
+        shutil.rmtree(self._staged, ignore_errors=True)
+        self._staged.mkdir()
+        plan, settings = self._plan, self._settings
+        dop_sources, dsm_sources = self._prepared(plan.dop, 0.0), self._prepared(plan.dsm, 0.1)
+        jobs: list[DopJob | DsmJob] = [
+            DopJob(
+                tuple(dop_sources[k] for k in tile.sources),
+                plan.dop.lattice,
+                tile.box,
+                plan.crs,
+                plan.area,
+                settings.compression,
+                settings.quality,
             )
-        yield _Source(dataset, path, grid, crs)
-
-
-def _check_dop(source: _Source) -> None:
-    dataset, path = source.dataset, source.path
-    if dataset.colorinterp[0] == ColorInterp.palette:
-        raise MapError(f"{path}: coloured by a palette; expand it with: gdal_translate -expand rgb")
-    for dtype in dataset.dtypes:
-        if dtype != "uint8":
-            raise MapError(
-                f"{path}: samples are {dtype}, the orthophoto must have 8 bits;"
-                " stretch it with: gdal_translate -ot Byte -scale LOW HIGH 0 255"
+            for tile in plan.dop.tiles
+        ]
+        jobs += [
+            DsmJob(
+                tuple(dsm_sources[k] for k in tile.sources),
+                plan.dsm.lattice,
+                tile.box,
+                plan.crs,
+                plan.area,
+                settings.max_z_error_m,
+                self._options.max_hole_cells,
             )
-    if dataset.count == 2 and _alpha_band(dataset) is None:
-        raise MapError(f"{path}: two bands, neither alpha; select one with: gdal_translate -b 1")
+            for tile in plan.dsm.tiles
+        ]
+        last = 0.7 if self._model_sha256 is not None else 0.92
+        records = self._done(jobs, 0.2, last, "compressing tiles")
+        count = len(plan.dop.tiles)
+        manifest = self._manifest(records[:count], jobs[:count], records[count:], jobs[count:])
+        if self._model_sha256 is not None:
+            manifest = self._with_features(manifest)
+        self._say(0.92, "checking the orthophoto against the surface model")
+        manifest = self._with_reports(manifest, records[:count], records[count:])
+        write_manifest(manifest, self._staged / MANIFEST_NAME)
+        self._say(0.98, "checking the pack")
+        Pack.open(self._staged)
+        return self._staged
 
+    # -- work ------------------------------------------------------------------------------------------
 
-def _check_dsm(source: _Source) -> None:
-    dataset, path = source.dataset, source.path
-    if any(c != ColorInterp.alpha for c in dataset.colorinterp[1:]):
-        raise MapError(f"{path}: {dataset.count} bands, expected one of heights; select it with: gdal_translate -b")
-    if not np.issubdtype(np.dtype(dataset.dtypes[0]), np.number) or "complex" in dataset.dtypes[0]:
-        raise MapError(f"{path}: samples are {dataset.dtypes[0]}, expected heights in metres")
-    unit = (dataset.units[0] or "").lower()
-    if unit not in ("", "m", "metre", "meter", "metres", "meters"):
-        raise MapError(f"{path}: heights are in {unit}; convert them to metres with gdal_calc.py")
+    def _prepared(self, layer: LayerPlan, start: float) -> list[Source]:
+        used = sorted({k for tile in layer.tiles for k in tile.sources})
+        jobs = {PrepareJob(layer.sources[k]): k for k in used}
+        sources = list(layer.sources)
+        for number, (job, source) in enumerate(self._run(list(jobs))):
+            assert isinstance(source, Source), "preparing gives a source"
+            sources[jobs[job]] = source
+            self._say(start + 0.1 * (number + 1) / len(jobs), f"reading sources ({layer.sources[0].kind.upper()})")
+        return sources
 
+    def _done(
+        self, jobs: Sequence[DopJob | DsmJob | FeatureJob], start: float, end: float, what: str
+    ) -> list[Record]:
+        """Records of all pieces of work, those of an earlier run taken over."""
+        records = {job_name(job): finished(job, self._work) for job in jobs}
+        waiting = [job for job in jobs if records[job_name(job)] is None]
+        if len(waiting) < len(jobs):
+            logger.info("%d of %d pieces are there from an earlier run", len(jobs) - len(waiting), len(jobs))
+        done = len(jobs) - len(waiting)
+        for job, record in self._run(waiting):
+            assert isinstance(record, Record), "a tile gives a record"
+            records[job_name(job)] = record
+            done += 1
+            self._say(start + (end - start) * done / len(jobs), what)
+        return [record for job in jobs if (record := records[job_name(job)]) is not None]
 
-def _common_crs(dop: _Source, dsm: _Source) -> str | None:
-    """The horizontal system of both, as "EPSG:n" where it has a code, else WKT."""
-    if (dop.crs is None) != (dsm.crs is None):
-        without, with_crs = (dop, dsm) if dop.crs is None else (dsm, dop)
-        raise MapError(
-            f"{without.path}: no CRS, but {with_crs.path.name} has one;"
-            " assign the right one with: gdal_translate -a_srs EPSG:n"
+    def _run(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, Record | Source]]:
+        return run_all(jobs, self._work, processes=self._workers.processes, dask=self._workers.dask)
+
+    # -- what it makes -----------------------------------------------------------------------------------
+
+    def _manifest(
+        self,
+        dop_records: Sequence[Record],
+        dop_jobs: Sequence[DopJob | DsmJob],
+        dsm_records: Sequence[Record],
+        dsm_jobs: Sequence[DopJob | DsmJob],
+    ) -> Manifest:
+        plan, options, settings = self._plan, self._options, self._settings
+        dop_tiles, dsm_tiles = [], []
+        dop_order, dsm_order = _shown(plan.dop, dop_records), _shown(plan.dsm, dsm_records)
+        for tile, job, record in zip(plan.dop.tiles, dop_jobs, dop_records, strict=True):
+            if record.bytes:
+                cells = np.frombuffer(record.matchability, np.uint8)
+                known = cells[cells != matchability.NO_MAP]
+                dop_tiles.append(
+                    DopTile(
+                        **self._tile("dop", plan.dop.lattice, tile.box, job, record),
+                        sources=tuple(dop_order[tile.sources[k]] for k in record.shown),
+                        matchability=round(float(known.mean()) / 100.0, 4) if len(known) else None,
+                    )
+                )
+        for tile, job, record in zip(plan.dsm.tiles, dsm_jobs, dsm_records, strict=True):
+            if record.bytes:
+                dsm_tiles.append(
+                    DsmTile(
+                        **self._tile("dsm", plan.dsm.lattice, tile.box, job, record),
+                        sources=tuple(dsm_order[tile.sources[k]] for k in record.shown),
+                        min_m=record.min_m,
+                        max_m=record.max_m,
+                        filled_fraction=record.filled_cells / (tile.box.width * tile.box.height),
+                    )
+                )
+        for name, tiles, layer in (("orthophoto", dop_tiles, plan.dop), ("surface model", dsm_tiles, plan.dsm)):
+            if not tiles:
+                raise MapError(
+                    f"{layer.sources[0].name}: no valid pixel of the {name} inside the area; check its nodata value"
+                    " or mask with gdalinfo, and --area"
+                )
+        dop = Dop(
+            lattice=plan.dop.lattice,
+            tiles=dop_tiles,
+            compression=_described(settings),
+            sources=_notes(plan.dop, dop_order, plan.crs),
+            date=options.dop_date,
+            attribution=options.attribution,
+            licence=options.licence,
+            true_ortho=options.true_ortho,
+            sigma_m=options.dop_sigma_m,
         )
-    if dop.crs is None or dsm.crs is None:
-        return None
-    ours, theirs = (projected_crs(str(source.crs), str(source.path)) for source in (dop, dsm))
-    # By name in the register first: WKT of one system differs in axes and metadata from program to program.
-    codes = ours.to_epsg(), theirs.to_epsg()
-    same = codes[0] == codes[1] if None not in codes else ours.equals(theirs, ignore_axis_order=True)
-    if not same:
-        target = f"EPSG:{codes[0]}" if codes[0] else f'"{ours.name}"'
-        raise MapError(
-            f"{dsm.path}: CRS is {theirs.name}, that of {dop.path.name} is {ours.name};"
-            f" reproject with: gdalwarp -t_srs {target} -r bilinear {dsm.path.name} OUT.tif"
+        dsm = Dsm(
+            lattice=plan.dsm.lattice,
+            tiles=dsm_tiles,
+            compression="LERC_ZSTD",
+            sources=_notes(plan.dsm, dsm_order, plan.crs),
+            date=options.dsm_date,
+            attribution=options.attribution,
+            licence=options.licence,
+            max_z_error_m=settings.max_z_error_m,
+            nodata=encode.NODATA,
+            sigma_m=options.dsm_sigma_m,
         )
-    return f"EPSG:{codes[0]}" if codes[0] else str(ours.to_wkt())
-
-
-def _check_overlap(dop: _Source, dsm: _Source) -> None:
-    a, b = dop.grid.bounds, dsm.grid.bounds
-    shared = max(min(a[2], b[2]) - max(a[0], b[0]), 0.0) * max(min(a[3], b[3]) - max(a[1], b[1]), 0.0)
-    if shared == 0.0:
-        raise MapError(
-            f"{dsm.path}: covers west, south, east, north {_rounded(b)}, {dop.path.name} covers {_rounded(a)};"
-            " they do not overlap, choose rasters of one area"
+        anchor = _anchor(plan.dop.lattice, layer_box(dop_tiles))
+        vertical, dsm_tiles = self._heights(anchor, dsm)
+        created = None
+        if options.created is not None:
+            created = options.created.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+        return Manifest(
+            format=FORMAT,
+            version=VERSION,
+            created=created,
+            crs=plan.crs,
+            anchor=anchor,
+            vertical=vertical,
+            dop=dop,
+            dsm=msgspec.structs.replace(dsm, tiles=dsm_tiles),
         )
-    coverage = shared / ((a[2] - a[0]) * (a[3] - a[1]))
-    if coverage < _SPARSE_COVERAGE:
-        logger.warning("%s covers only %.0f %% of the orthophoto; there is no fix outside it", dsm.path, 100 * coverage)
+
+    def _tile(
+        self, layer: str, lattice: Lattice, box: PixelBox, job: Job, record: Record
+    ) -> dict[str, object]:
+        file = f"{layer}/{lattice.tile_name(box)}.tif"
+        self._take(job, file)
+        return {
+            "file": file,
+            "bytes": record.bytes,
+            "sha256": record.sha256,
+            "column": box.column,
+            "row": box.row,
+            "width": box.width,
+            "height": box.height,
+            "valid_fraction": record.valid_fraction,
+            "segment_crc32": record.segment_crc32,
+        }
+
+    def _take(self, job: Job, file: str) -> None:
+        """The file of a piece of work under its name in the pack; the work keeps it, for a build cut off now."""
+        target = self._staged / file
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            os.link(self._work / job_name(job), target)
+        except OSError:
+            shutil.copyfile(self._work / job_name(job), target)
+
+    def _heights(self, anchor: tuple[float, float], dsm: Dsm) -> tuple[VerticalDatum, list[DsmTile]]:
+        """The vertical datum at the anchor, and the tiles with the offsets of their own."""
+        crs, options = self._plan.crs, self._options
+        kind, epsg = _vertical_kind(options, self._plan.dsm.sources)
+        if crs is None:
+            return derive_vertical(kind, epsg, options.geoid_undulation_m, None), dsm.tiles
+        centres = []
+        for tile in dsm.tiles:
+            west, south, east, north = dsm.lattice.grid(tile.box).bounds
+            centres.append(((west + east) / 2, (south + north) / 2))
+        lat_lon = lat_lon_of(crs, [anchor, *centres])
+        caveat = datum_shift_caveat(crs, (float(lat_lon[0, 0]), float(lat_lon[0, 1])))
+        if caveat is not None:
+            logger.warning("%s: %s", crs, caveat)
+        vertical, amsl, ellipsoid = derive_offsets(kind, epsg, options.geoid_undulation_m, lat_lon)
+        tiles = [
+            msgspec.structs.replace(
+                tile,
+                amsl_minus_map_m=None if amsl is None else round(float(amsl[k + 1]), 4),
+                ellipsoid_minus_map_m=None if ellipsoid is None else round(float(ellipsoid[k + 1]), 4),
+            )
+            for k, tile in enumerate(dsm.tiles)
+        ]
+        return vertical, tiles
+
+    def _with_features(self, manifest: Manifest) -> Manifest:
+        assert self._options.features is not None and self._model_sha256 is not None, "asked for"
+        jobs = [
+            FeatureJob(
+                str(self._staged / tile.file),
+                tile.sha256,
+                self._options.features,
+                self._model_sha256,
+                self._options.features_per_mpx,
+            )
+            for tile in manifest.dop.tiles
+        ]
+        tiles = []
+        for index, (job, record) in enumerate(
+            zip(jobs, self._done(jobs, 0.7, 0.92, "extracting features"), strict=True)
+        ):
+            if record.bytes:
+                tile = manifest.dop.tiles[index]
+                file = f"features/{Path(tile.file).stem}.npy"
+                self._take(job, file)
+                tiles.append(
+                    FeatureTile(
+                        file=file,
+                        bytes=record.bytes,
+                        sha256=record.sha256,
+                        dop=index,
+                        dop_sha256=tile.sha256,
+                        counts=record.counts,
+                    )
+                )
+        layer = FeatureLayer(
+            matcher=self._options.features,
+            model_sha256=self._model_sha256,
+            encoding=features.ENCODING,
+            per_mpx=self._options.features_per_mpx,
+            tiles=tiles,
+        )
+        return msgspec.structs.replace(manifest, features=layer)
+
+    def _with_reports(
+        self, manifest: Manifest, dop_records: Sequence[Record], dsm_records: Sequence[Record]
+    ) -> Manifest:
+        """With everything beside the tiles: what the checks found, mosaics and STAC for a GIS."""
+        georeference = Georeference(manifest.crs, manifest.vertical, manifest.anchor)
+        manifest = msgspec.structs.replace(manifest, alignment=self._checked(manifest))
+        dop_cells = [record for record in dop_records if record.bytes]
+        dsm_cells = [record for record in dsm_records if record.bytes]
+        reports = {
+            "reports/coverage.geojson": coverage.coverage_geojson(
+                manifest,
+                georeference,
+                [_cells(tile, record.share) for tile, record in zip(manifest.dop.tiles, dop_cells, strict=True)],
+                [_cells(tile, record.share) for tile, record in zip(manifest.dsm.tiles, dsm_cells, strict=True)],
+                [hole for record in dsm_cells for hole in record.filled],
+            ),
+            "reports/matchability.tif": matchability.matchability_tif(
+                manifest,
+                [_cells(tile, record.matchability) for tile, record in zip(manifest.dop.tiles, dop_cells, strict=True)],
+                [_cells(tile, record.share) for tile, record in zip(manifest.dsm.tiles, dsm_cells, strict=True)],
+            ),
+            "dop.vrt": vrt.mosaic(manifest.dop, manifest.crs),
+            "dsm.vrt": vrt.mosaic(manifest.dsm, manifest.crs),
+            **stac.stac_files(manifest, georeference),
+        }
+        notes = []
+        for file, data in reports.items():
+            target = self._staged / file
+            target.parent.mkdir(parents=True, exist_ok=True)
+            write_file(target, data)
+            notes.append(FileNote(file=file, bytes=len(data), sha256=hashlib.sha256(data).hexdigest()))
+        return msgspec.structs.replace(manifest, files=notes)
+
+    def _checked(self, manifest: Manifest) -> Alignment | None:
+        """How DOP and DSM lie on each other, on tiles spread over the pack; what looks wrong is logged."""
+        step = -(-len(manifest.dop.tiles) // _MAX_CHECKED_TILES)
+        dop = manifest.dop.tiles[step // 2 :: step]
+        boxes = [manifest.dop.lattice.grid(tile.box).bounds for tile in dop]
+        dsm = [
+            tile
+            for tile in manifest.dsm.tiles
+            if any(_touch(manifest.dsm.lattice.grid(tile.box).bounds, box) for box in boxes)
+        ]
+        if not dsm:
+            return None
+        part = msgspec.structs.replace(
+            manifest,
+            dop=msgspec.structs.replace(manifest.dop, tiles=dop),
+            dsm=msgspec.structs.replace(manifest.dsm, tiles=dsm),
+            features=None,
+        )
+        georeference = Georeference(manifest.crs, manifest.vertical, manifest.anchor)
+        with MapStore(Pack(self._staged, part, georeference), cache_bytes=_BUILD_CACHE_BYTES) as store:
+            found = alignment.measure(store)
+            problems = [*alignment.warnings(found, manifest.dsm.gsd_m), *alignment.misplaced(store)]
+        for problem in problems:
+            logger.warning("%s", problem)
+        return found
 
 
-def _rounded(bounds: tuple[float, ...]) -> tuple[float, ...]:
-    return tuple(round(v, 1) for v in bounds)
+def _shown(layer: LayerPlan, records: Sequence[Record]) -> dict[int, int]:
+    """Sources of the plan that are visible in the pack, and their numbers in its list."""
+    seen = {tile.sources[k] for tile, record in zip(layer.tiles, records, strict=True) for k in record.shown}
+    return {k: number for number, k in enumerate(sorted(seen))}
 
 
-def _anchor(grid: RasterGrid) -> tuple[float, float]:
-    west, south, east, north = grid.bounds
+def _notes(layer: LayerPlan, order: dict[int, int], crs: str | None) -> list[SourceNote]:
+    return [
+        SourceNote(
+            name=layer.sources[k].name,
+            date=layer.sources[k].date,
+            crs=layer.sources[k].crs,
+            gsd_m=_gsd(layer, k),
+            resampled=layer.resampled(k, crs),
+        )
+        for k in order
+    ]
+
+
+def _gsd(layer: LayerPlan, index: int) -> float:
+    west, south, east, north = layer.bounds[index]
+    grid = layer.sources[index].grid
+    return round(float(np.sqrt((east - west) * (north - south) / (grid.width * grid.height))), 6)
+
+
+def _described(settings: Settings) -> str:
+    if settings.compression == "webp" and settings.quality == 100:
+        return "WEBP lossless"
+    return f"{settings.compression.upper()} quality {settings.quality}"
+
+
+def _anchor(lattice: Lattice, box: PixelBox) -> tuple[float, float]:
+    west, south, east, north = lattice.grid(box).bounds
     step = 100.0 if min(east - west, north - south) >= 400.0 else 10.0
     return round((west + east) / 2 / step) * step, round((south + north) / 2 / step) * step
 
 
-def _vertical(options: PackOptions, crs: str | None, anchor: tuple[float, float], dsm: _Source) -> VerticalDatum:
-    kind, epsg = options.vertical, options.vertical_epsg
-    named = None if dsm.crs is None else vertical_of(dsm.crs, str(dsm.path))
-    if kind is None and named is not None:
-        kind, epsg = named[0], epsg if epsg is not None else named[1]
-    elif kind is None:
-        kind = "unknown"
-    elif named is not None and kind != named[0]:
-        logger.warning("%s: its CRS says %s heights, --vertical %s is taken", dsm.path, named[0], kind)
-    elif named is not None and epsg is None:
-        epsg = named[1]
-    lat_lon = None
-    if crs is not None:
-        lon, lat = pyproj.Proj(projected_crs(crs, str(dsm.path)))(*anchor, inverse=True)
-        lat_lon = (lat, lon)
-        caveat = datum_shift_caveat(crs, lat_lon)
-        if caveat is not None:
-            logger.warning("%s: %s", dsm.path, caveat)
-    return derive_vertical(kind, epsg, options.geoid_undulation_m, lat_lon)
+def _cells(tile: DopTile | DsmTile, data: bytes) -> np.ndarray:
+    return np.frombuffer(data, np.uint8).reshape(tile.height // CROP_PX, tile.width // CROP_PX)
 
 
-@contextmanager
-def _staging(out: Path) -> Iterator[Path]:
-    """A directory beside ``out``: a rename within one file system is atomic, one across is a copy."""
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        staged = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent))
-        # mkdtemp's 0700 would lock out the daemon's user.
-        staged.chmod(0o755)
-    except OSError as err:
-        raise MapError(f"{out.parent}: cannot be written ({err.strerror}); choose another output path") from err
-    try:
-        yield staged
-    except (RasterioError, OSError) as err:
-        # rasterio's own text is "see previous exception"; GDAL's is at the root of the chain.
-        root: BaseException = err
-        while root.__cause__ is not None:
-            root = root.__cause__
-        free_mb = shutil.disk_usage(out.parent).free / 1e6
-        raise MapError(
-            f"{out}: cannot be written ({root}; {free_mb:.0f} MB free); check free space and permissions"
-        ) from err
-    finally:
-        shutil.rmtree(staged, ignore_errors=True)
-
-
-def _install(staged: Path, out: Path) -> None:
-    if not out.exists():
-        staged.rename(out)
-    else:
-        aside = out.with_name(f".{out.name}.{secrets.token_hex(4)}.old")
-        out.rename(aside)
-        try:
-            staged.rename(out)
-        except BaseException:
-            aside.rename(out)
-            raise
-        _fsync(out.parent)
-        shutil.rmtree(aside, ignore_errors=True)
-    _fsync(out.parent)
-
-
-def _fsync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-def _write(
-    dop: _Source,
-    dsm: _Source,
-    staged: Path,
-    *,
-    georeference: Georeference,
-    options: PackOptions,
-    say: Progress,
-) -> Manifest:
-    max_z_error_m = options.max_z_error_m or min(_MAX_Z_ERROR_M, round(dsm.grid.gsd_m * _MAX_Z_ERROR_PER_GSD, 6))
-    folder = staged / "work"
-    folder.mkdir()
-    work, valid_work = folder / "work.tif", folder / "valid.tif"
-
-    valid = _normalise_dop(dop, work, lambda done: say(0.3 * done, "reading the orthophoto"))
-    say(0.3, "compressing the orthophoto")
-    _to_cog(work, staged / _DOP_NAME, compress=options.dop_compression.upper(), quality=options.quality)
-    dop_written = _described(staged / _DOP_NAME, valid)
-
-    work.unlink()
-    valid = _normalise_dsm(dsm, work, valid_work, lambda done: say(0.6 + 0.15 * done, "reading the surface model"))
-    say(0.75, "compressing the surface model")
-    levelled = _with_surface_levels(work, valid_work)
-    _to_cog(levelled, staged / _DSM_NAME, compress="LERC_ZSTD", max_z_error=max_z_error_m, overviews="AUTO")
-    dsm_written = _described(staged / _DSM_NAME, valid)
-    shutil.rmtree(folder)
-
-    return Manifest(
-        format=FORMAT,
-        version=VERSION,
-        created=(options.created or datetime.now(UTC)).astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
-        crs=georeference.crs,
-        anchor=georeference.anchor,
-        vertical=georeference.vertical,
-        dop=Dop(
-            **_common_fields(_DOP_NAME, dop, dop_written, options),
-            compression=f"{options.dop_compression.upper()} quality {options.quality}",
-            date=options.dop_date,
-            true_ortho=options.true_ortho,
-            sigma_m=options.dop_sigma_m,
-        ),
-        dsm=Dsm(
-            **_common_fields(_DSM_NAME, dsm, dsm_written, options),
-            compression="LERC_ZSTD",
-            date=options.dsm_date,
-            max_z_error_m=max_z_error_m,
-            nodata=NODATA,
-            sigma_m=options.dsm_sigma_m,
-        ),
-    )
-
-
-def _common_fields(name: str, source: _Source, written: _Written, options: PackOptions) -> dict[str, Any]:
-    return {
-        "file": name,
-        "gsd_m": written.grid.gsd_m,
-        "grid": Grid.of(written.grid),
-        "levels": written.levels,
-        "valid_fraction": written.valid_fraction,
-        "bytes": written.size,
-        "sha256": written.sha256,
-        "segment_crc32": encode_crcs(written.crcs),
-        "source": source.path.name,
-        "attribution": options.attribution,
-        "licence": options.licence,
-    }
-
-
-def _described(path: Path, valid_fraction: float) -> _Written:
-    data = path.read_bytes()
-    with Cog(data, path) as cog:
-        return _Written(
-            cog.grids[0],
-            len(cog.grids),
-            valid_fraction,
-            hashlib.sha256(data).hexdigest(),
-            len(data),
-            cog.segment_crcs(),
-        )
-
-
-def _normalise_dop(source: _Source, work: Path, done: Callable[[float], None]) -> float:
-    """Copy to three bands and a mask. Returns: the share of valid pixels.
-
-    A fourth band without the alpha flag is infrared in the state surveys' orthophotos, so only the flag makes it
-    a mask.
-    """
-    dataset, grid = source.dataset, source.grid
-    alpha = _alpha_band(dataset)
-    bands = [1, 2, 3] if dataset.count - (alpha is not None) >= 3 else [1, 1, 1]
-
-    def step(window: Window) -> tuple[Any, npt.NDArray[np.bool_]]:
-        pixels = _read(source, bands, window)
-        return pixels, _read(source, alpha, window) > 127 if alpha is not None else _mask(source, window)
-
-    def black(window: Window) -> npt.NDArray[np.bool_]:
-        pixels, valid = step(window)
-        found: npt.NDArray[np.bool_] = valid & ~pixels.any(axis=0)
-        return found
-
-    collar = Collar(grid.width, grid.height, black)
-    share = collar.cells / (grid.width * grid.height)
-    if fill := share >= _MIN_BLACK_SHARE:
-        logger.warning(
-            "%s: black from the border inward, %.1f %% of it, taken for no data, though the file does not declare it;"
-            " nearblack -setmask or gdal_edit.py -a_nodata 0 does",
-            source.path,
-            100 * share,
-        )
-    profile = _work_profile(source, count=3, dtype="uint8", photometric="RGB")
-    valid_px = 0
-    # Internal, so that the COG driver carries the mask into the one file.
-    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(work, "w", **profile) as target:
-        for window in _chunks(grid, done):
-            pixels, valid = step(window)
-            if fill:
-                valid &= ~collar.mask(window)
-            # One colour outside: what a lossy source has there is noise that costs bytes.
-            pixels *= valid
-            target.write(pixels, window=window)
-            target.write_mask(valid, window=window)
-            valid_px += int(np.count_nonzero(valid))
-    if valid_px == 0:
-        raise MapError(f"{source.path}: no valid pixel; check its nodata value or mask with gdalinfo")
-    return valid_px / (grid.width * grid.height)
-
-
-def _normalise_dsm(source: _Source, work: Path, valid_work: Path, done: Callable[[float], None]) -> float:
-    """Copy to float32 heights with one nodata value, and validity (0 or 1) to a raster of its own.
-
-    Returns: the share of valid cells.
-    """
-    profile = _work_profile(source, count=1, dtype="float32", nodata=NODATA, predictor=3)
-    valid_profile = _work_profile(source, count=1, dtype="float32")
-    collar = _zero_collar(source)
-    valid_px, spikes_px, undeclared = 0, 0, set()
-    lowest, highest = np.inf, -np.inf
-    with rasterio.open(work, "w", **profile) as target, rasterio.open(valid_work, "w", **valid_profile) as share:
-        for window in _chunks(source.grid, done):
-            heights, valid, sentinels = _heights(source, window)
-            undeclared.update(sentinels)
-            if collar is not None:
-                valid &= ~collar.mask(window)
-            spikes = valid & ((heights < _MIN_HEIGHT_M) | (heights > _MAX_HEIGHT_M))
-            if spikes.any():
-                spikes_px += int(np.count_nonzero(spikes))
-                lowest = min(lowest, float(heights[spikes].min()))
-                highest = max(highest, float(heights[spikes].max()))
-                valid &= ~spikes
-            target.write(np.where(valid, heights, NODATA).astype(np.float32), 1, window=window)
-            share.write(valid.astype(np.float32), 1, window=window)
-            valid_px += int(np.count_nonzero(valid))
-    if spikes_px:
-        spike_share = spikes_px / (valid_px + spikes_px)
-        _judge_spikes(source.path, spikes_px, spike_share, lowest, highest)
-    if valid_px == 0:
-        raise MapError(f"{source.path}: no valid height; check its nodata value with gdalinfo")
-    if undeclared:
-        values = ", ".join(f"{v:g}" for v in sorted(undeclared)[:5])
-        logger.warning(
-            "%s: %s taken for nodata, though the file does not declare it; gdal_edit.py -a_nodata does",
-            source.path,
-            values,
-        )
-    return valid_px / (source.grid.width * source.grid.height)
-
-
-def _heights(source: _Source, window: Window) -> tuple[Any, npt.NDArray[np.bool_], list[float]]:
-    """Heights in metres, their validity, and the undeclared nodata values among them."""
-    dataset = source.dataset
-    raw = _read(source, 1, window).astype(np.float64)
-    valid = _mask(source, window) & np.isfinite(raw)
-    sentinels = []
-    low_or_huge = valid & ((raw < _MIN_HEIGHT_M) | (raw > _SENTINEL_MAGNITUDE))
-    if low_or_huge.any():
-        sentinel = low_or_huge & (np.isin(raw, _SENTINELS) | (np.abs(raw) > _SENTINEL_MAGNITUDE))
-        sentinels = np.unique(raw[sentinel]).tolist()
-        valid &= ~sentinel
-    return raw * dataset.scales[0] + dataset.offsets[0], valid, sentinels
-
-
-def _zero_collar(source: _Source) -> Collar | None:
-    """Heights of exactly zero from the border inward, if the rest of the surface lies far from zero."""
-    grid = source.grid
-
-    def zero(window: Window) -> npt.NDArray[np.bool_]:
-        heights, valid, _ = _heights(source, window)
-        found: npt.NDArray[np.bool_] = valid & (heights == 0.0)
-        return found
-
-    collar = Collar(grid.width, grid.height, zero)
-    if collar.cells == 0:
-        return None
-    rest, near = 0, 0
-    for window in windows(grid.width, grid.height):
-        heights, valid, _ = _heights(source, window)
-        valid &= ~collar.mask(window)
-        rest += int(np.count_nonzero(valid))
-        near += int(np.count_nonzero(valid & (np.abs(heights) <= _FILL_DISTANCE_M)))
-    if rest == 0 or near > _MAX_NEAR_FILL_SHARE * rest:
-        return None
-    logger.warning(
-        "%s: heights of exactly 0 from the border inward, %.1f %% of it, taken for nodata, though the file does not"
-        " declare it; gdal_edit.py -a_nodata 0 does",
-        source.path,
-        100 * collar.cells / (grid.width * grid.height),
-    )
-    return collar
-
-
-def _judge_spikes(path: Path, count: int, share: float, lowest: float, highest: float) -> None:
-    limits = f"{_MIN_HEIGHT_M:g} to {_MAX_HEIGHT_M:g} m"
-    if share >= _MAX_SPIKE_SHARE:
-        raise MapError(
-            f"{path}: {100 * share:.1f} % of the heights lie beyond {limits} ({lowest:g} to {highest:g} m);"
-            " probably an undeclared nodata value, declare it with: gdal_edit.py -a_nodata VALUE"
-        )
-    logger.warning(
-        "%s: %d heights (%.2g %%) beyond %s (%g to %g m) taken for nodata",
-        path,
-        count,
-        100 * share,
-        limits,
-        lowest,
-        highest,
-    )
-
-
-def _read(source: _Source, bands: int | list[int], window: Window) -> Any:
-    try:
-        return source.dataset.read(bands, window=window)
-    except (RasterioError, OSError) as err:
-        raise MapError(f"{source.path}: cannot be decoded ({err}); fetch or export it again") from err
-
-
-def _mask(source: _Source, window: Window) -> npt.NDArray[np.bool_]:
-    try:
-        mask: npt.NDArray[np.bool_] = source.dataset.dataset_mask(window=window) > 0
-    except (RasterioError, OSError) as err:
-        raise MapError(f"{source.path}: mask cannot be decoded ({err}); fetch or export it again") from err
-    return mask
-
-
-def _alpha_band(dataset: Any) -> int | None:
-    return next((k for k, c in enumerate(dataset.colorinterp, 1) if c == ColorInterp.alpha), None)
-
-
-def _chunks(grid: RasterGrid, done: Callable[[float], None]) -> Iterator[Window]:
-    for window in windows(grid.width, grid.height):
-        yield window
-        if window.col_off + window.width == grid.width:
-            done((window.row_off + window.height) / grid.height)
-
-
-def _work_profile(source: _Source, **more: Any) -> dict[str, Any]:
-    grid = source.grid
-    crs = None if source.crs is None else _rasterio_crs(source)
-    return {
-        "driver": "GTiff",
-        "width": grid.width,
-        "height": grid.height,
-        "transform": source.dataset.transform,
-        "crs": crs,
-        "tiled": True,
-        "blockxsize": BLOCK_PX,
-        "blockysize": BLOCK_PX,
-        "compress": "ZSTD",
-        "zstd_level": 1,
-        "interleave": "pixel",
-        "bigtiff": "IF_SAFER",
-        **more,
-    }
-
-
-def _rasterio_crs(source: _Source) -> Any:
-    """Horizontal part only: DOP and DSM of a pack name the same system, heights are the manifest's."""
-    crs = projected_crs(str(source.crs), str(source.path))
-    try:
-        return rasterio.CRS.from_user_input(f"EPSG:{crs.to_epsg()}" if crs.to_epsg() else crs.to_wkt())
-    except (RasterioError, CRSError) as err:
-        raise MapError(f"{source.path}: {crs.name} is not known to GDAL ({err}); reproject to UTM") from err
-
-
-def _with_surface_levels(work: Path, valid_work: Path) -> Path:
-    """Overviews in which a cell has data only where 3 in 4 of the cells below it have.
-
-    GDAL's AVERAGE leaves out nodata, so that one valid cell of four makes a valid average, one of sixteen two
-    levels up: every scattered hole would be closed with the heights around it.
-    Returns: a VRT of ``work`` with these levels, beside it.
-    """
-    with rasterio.open(work) as full:
-        profile, size = full.profile, max(full.width, full.height)
-    factors: list[int] = []
-    while size > BLOCK_PX:  # as the COG driver does
-        factors.append(2 << len(factors))
-        size = -(-size // 2)
-    vrt = work.with_suffix(".vrt")
-    rasterio.shutil.copy(work, vrt, driver="VRT")
-    if not factors:
-        return vrt
-    for path in (work, valid_work):
-        with rasterio.open(path, "r+") as dataset:
-            dataset.build_overviews(factors, Resampling.average)
-    entries = ""
-    for level in range(len(factors)):
-        name = f"level{level + 1}.tif"
-        with (
-            rasterio.open(work, overview_level=level) as averaged,
-            rasterio.open(valid_work, overview_level=level) as share,
-        ):
-            profile.update(width=averaged.width, height=averaged.height, transform=averaged.transform)
-            with rasterio.open(work.with_name(name), "w", **profile) as target:
-                for window in windows(averaged.width, averaged.height):
-                    heights = averaged.read(1, window=window)
-                    # Rounding of GDAL's weights must not decide over exactly 3 of 4.
-                    heights[share.read(1, window=window) < _MIN_VALID_SHARE - 1e-4] = NODATA
-                    target.write(heights, 1, window=window)
-        entries += (
-            f'<Overview><SourceFilename relativeToVRT="1">{name}</SourceFilename>'
-            "<SourceBand>1</SourceBand></Overview>"
-        )
-    vrt.write_text(vrt.read_text().replace("</VRTRasterBand>", entries + "</VRTRasterBand>"))
-    return vrt
-
-
-def _to_cog(work: Path, out: Path, *, overviews: str = "IGNORE_EXISTING", **compression: Any) -> None:
-    """AVERAGE leaves out masked pixels, so that their colour does not bleed into an overview."""
-    rasterio.shutil.copy(
-        work,
-        out,
-        driver="COG",
-        blocksize=BLOCK_PX,
-        overviews=overviews,
-        overview_resampling="AVERAGE",
-        bigtiff="IF_SAFER",
-        num_threads="ALL_CPUS",
-        **compression,
-    )
+def _touch(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]

@@ -1,0 +1,428 @@
+"""The work of a build in pieces that run anywhere: each reads sources and writes one file and one record.
+
+A piece is named by the hash of all that goes into it, and finished when its record is there; so a build that was
+cut off goes on where it was, and one with another quality keeps the heights.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import logging
+import os
+import pickle
+import signal
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, TypeVar
+
+import cv2
+import msgspec
+import numpy as np
+import rasterio
+from rasterio.errors import RasterioError
+from rasterio.io import MemoryFile
+
+from ortholoc_edge.errors import ConfigError, MapError, OrtholocError
+from ortholoc_edge.geometry.arrays import BoolArray, Float32Array
+from ortholoc_edge.matching.registry import make_matcher
+from ortholoc_edge.tiles import coverage, encode, features, matchability
+from ortholoc_edge.tiles.area import MapArea
+from ortholoc_edge.tiles.cog import Cog, PixelWindow, quiet_georeference
+from ortholoc_edge.tiles.holes import fill_small_holes
+from ortholoc_edge.tiles.lattice import LEVELS, Lattice, PixelBox
+from ortholoc_edge.tiles.manifest import encode_crcs
+from ortholoc_edge.tiles.mosaic import dop_mosaic, dsm_mosaic
+from ortholoc_edge.tiles.prepare import prepare
+from ortholoc_edge.tiles.sources import Source, fingerprint
+
+logger = logging.getLogger(__name__)
+
+# Part of every hash: raise it when the same input makes other bytes.
+_RECIPE = 1
+_WORKER_CACHE_BYTES = 64 * 2**20
+_PR_SET_PDEATHSIG = 1
+
+
+class Record(msgspec.Struct, frozen=True, kw_only=True):
+    """What a piece of work wrote; a file's name is that of the record.
+
+    Attributes:
+        bytes, sha256: of the file; 0 and "" where there was nothing to write.
+        valid_fraction: of a tile.
+        segment_crc32: of a tile.
+        shown: sources that contributed a pixel, as indices into the job's sources.
+        share: per 64 x 64 px cell, percent of valid pixels, (H/64, W/64) uint8 in row order.
+        matchability: of a DOP tile, per cell, likewise.
+        min_m, max_m, filled_cells: of a DSM tile.
+        filled: centres and cell counts of the small holes that were closed: (easting, northing, cells).
+        counts: features per level, of a feature file.
+    """
+
+    bytes: int = 0
+    sha256: str = ""
+    valid_fraction: float = 0.0
+    segment_crc32: str = ""
+    shown: tuple[int, ...] = ()
+    share: bytes = b""
+    matchability: bytes = b""
+    min_m: float = 0.0
+    max_m: float = 0.0
+    filled_cells: int = 0
+    filled: tuple[tuple[float, float, int], ...] = ()
+    counts: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class PrepareJob:
+    """Bring an awkward source into a form from which windows can be read fast."""
+
+    source: Source
+
+
+@dataclass(frozen=True, slots=True)
+class DopJob:
+    """One tile of the orthophoto from its sources, newest first."""
+
+    sources: tuple[Source, ...]
+    lattice: Lattice
+    box: PixelBox
+    crs: str | None
+    area: MapArea | None
+    compression: encode.Compression
+    quality: int
+
+
+@dataclass(frozen=True, slots=True)
+class DsmJob:
+    """One tile of the surface model from its sources, newest first."""
+
+    sources: tuple[Source, ...]
+    lattice: Lattice
+    box: PixelBox
+    crs: str | None
+    area: MapArea | None
+    max_z_error_m: float
+    max_hole_cells: int
+
+
+@dataclass(frozen=True, slots=True)
+class FeatureJob:
+    """Features of a finished DOP tile, as it will be decoded in flight."""
+
+    dop_path: str
+    dop_sha256: str
+    matcher: str
+    model_sha256: str
+    per_mpx: float
+
+
+Job = PrepareJob | DopJob | DsmJob | FeatureJob
+_J = TypeVar("_J", bound=Job)
+Run = Callable[[Job, Path], "Record | Source"]
+
+
+def job_name(job: Job) -> str:
+    """Hash of all that goes into a piece of work."""
+    digest = hashlib.sha256()
+    digest.update(f"{_RECIPE} {type(job).__name__} {rasterio.__version__} {rasterio.__gdal_version__}".encode())
+    if not isinstance(job, FeatureJob):
+        sources = (job.source,) if isinstance(job, PrepareJob) else job.sources
+        for source in sources:
+            digest.update(fingerprint(source).encode())
+    if isinstance(job, DopJob | DsmJob):
+        rest = tuple(getattr(job, name) for name in job.__slots__ if name not in ("sources", "area"))
+        digest.update(repr(rest).encode())
+        digest.update(pickle.dumps(job.area, protocol=4))
+    elif isinstance(job, FeatureJob):
+        digest.update(repr((job.dop_sha256, job.matcher, job.model_sha256, job.per_mpx)).encode())
+    return digest.hexdigest()[:32]
+
+
+def finished(job: DopJob | DsmJob | FeatureJob, folder: Path) -> Record | None:
+    """The record of an earlier run, if its file is there and has the bytes that it should."""
+    name = job_name(job)
+    try:
+        record = msgspec.msgpack.decode((folder / f"{name}.record").read_bytes(), type=Record)
+        if record.bytes and _sha256((folder / name).read_bytes()) != record.sha256:
+            return None
+    except (OSError, msgspec.MsgspecError):
+        return None
+    return record
+
+
+def run_job(job: Job, folder: Path) -> Record | Source:
+    """Do a piece of work, in any process that sees ``folder``.
+
+    Raises: MapError and ConfigError for what is wrong with its input; nothing else that can be foreseen.
+    """
+    if isinstance(job, PrepareJob):
+        return prepare(job.source, folder)
+    if isinstance(job, DopJob):
+        data, record = _dop_tile(job)
+    elif isinstance(job, DsmJob):
+        data, record = _dsm_tile(job)
+    else:
+        data, record = _feature_tile(job)
+    name = job_name(job)
+    if data:
+        write_file(folder / name, data)
+        record = msgspec.structs.replace(record, bytes=len(data), sha256=_sha256(data))
+    write_file(folder / f"{name}.record", msgspec.msgpack.encode(record))
+    return record
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """All of it or nothing, also after a power cut.
+
+    Raises: MapError naming the file and the free space.
+    """
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        with part.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError as err:
+        part.unlink(missing_ok=True)
+        raise MapError(f"{path}: cannot be written ({err.strerror}); check free space and permissions") from err
+
+
+def _dop_tile(job: DopJob) -> tuple[bytes, Record]:
+    grid = job.lattice.grid(job.box)
+    rgb, valid, nir, shown = dop_mosaic(job.sources, grid, job.crs, job.area)
+    if not shown:
+        return b"", Record()
+    data = encode.dop_cog(rgb, valid, grid, job.crs, job.compression, job.quality)
+    _check_dop(data, valid)
+    cells = matchability.cells(np.ascontiguousarray(np.moveaxis(rgb, 0, -1)), valid, grid.gsd_m, nir)
+    return data, Record(
+        valid_fraction=float(valid.mean()),
+        segment_crc32=_segments(data),
+        shown=shown,
+        share=coverage.cell_share(valid).tobytes(),
+        matchability=cells.tobytes(),
+    )
+
+
+def _dsm_tile(job: DsmJob) -> tuple[bytes, Record]:
+    grid = job.lattice.grid(job.box)
+    heights, wanted, shown = dsm_mosaic(job.sources, grid, job.crs, job.area)
+    if not shown:
+        return b"", Record()
+    heights, holes = fill_small_holes(heights, wanted, job.max_hole_cells)
+    data = encode.dsm_cog(heights, grid, job.crs, job.max_z_error_m)
+    _check_dsm(data, heights, job.max_z_error_m)
+    valid = np.isfinite(heights)
+    centres = grid.map_from_px([(hole.column, hole.row) for hole in holes]) if holes else np.empty((0, 2))
+    return data, Record(
+        valid_fraction=float(valid.mean()),
+        segment_crc32=_segments(data),
+        shown=shown,
+        share=coverage.cell_share(valid).tobytes(),
+        min_m=float(np.nanmin(heights)),
+        max_m=float(np.nanmax(heights)),
+        filled_cells=sum(hole.cells for hole in holes),
+        filled=tuple(
+            (round(float(east), 3), round(float(north), 3), hole.cells)
+            for (east, north), hole in zip(centres, holes, strict=True)
+        ),
+    )
+
+
+def _feature_tile(job: FeatureJob) -> tuple[bytes, Record]:
+    matcher = _matcher(job.matcher, job.model_sha256)
+    path = Path(job.dop_path)
+    with Cog(path.read_bytes(), path) as cog:
+        levels = []
+        for level, grid in enumerate(cog.grids):
+            image, valid = cog.read_image(level, PixelWindow(0, 0, grid.width, grid.height))
+            levels.append((np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8), valid))
+    data, counts = features.extract_tile(levels, matcher, job.per_mpx)
+    return data, Record(counts=tuple(counts))
+
+
+@functools.cache
+def _matcher(name: str, model_sha256: str) -> Any:
+    matcher = make_matcher(name, working_px=features.WORKING_PX, max_keypoints=features.MAX_KEYPOINTS, threads=1)
+    if matcher.model_sha256 != model_sha256:
+        raise ConfigError(
+            f"matcher {name}: this machine's model has SHA-256 {matcher.model_sha256}, the build's {model_sha256};"
+            f" build it alike everywhere with: ortholoc-edge models build {name}"
+        )
+    return matcher
+
+
+def _segments(data: bytes) -> str:
+    with Cog(data, Path("tile")) as cog:
+        return encode_crcs(cog.segment_crcs())
+
+
+def _check_dop(data: bytes, valid: BoolArray) -> None:
+    """Decode every level of what will be flown with, while the truth is at hand."""
+    with quiet_georeference(), MemoryFile(data) as memory:
+        for level in range(LEVELS):
+            with _level(memory, level) as dataset:
+                dataset.read()
+                if level == 0 and not np.array_equal(dataset.dataset_mask() > 0, valid):
+                    raise MapError("a compressed tile lost its mask; this GDAL is not fit to build, update rasterio")
+
+
+def _check_dsm(data: bytes, heights: Float32Array, max_z_error_m: float) -> None:
+    with quiet_georeference(), MemoryFile(data) as memory:
+        for level in range(LEVELS):
+            with _level(memory, level) as dataset:
+                found = dataset.read(1)
+            if level > 0:
+                continue
+            hole = np.isnan(heights)
+            # Float32 at 9000 m resolves half a millimetre.
+            worst = float(np.abs(found - heights)[~hole].max(initial=0.0))
+            if not np.array_equal(found == np.float32(encode.NODATA), hole) or worst > max_z_error_m + 1e-3:
+                raise MapError(
+                    f"a compressed tile is off by {worst:.3f} m, {max_z_error_m} m were asked for;"
+                    " this GDAL is not fit to build, update rasterio"
+                )
+
+
+def _level(memory: MemoryFile, level: int) -> Any:
+    try:
+        return memory.open() if level == 0 else memory.open(overview_level=level - 1)
+    except RasterioError as err:
+        raise MapError(f"a compressed tile does not read back ({err}); update rasterio") from err
+
+
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+# -- where the pieces run ------------------------------------------------------------------------------
+
+
+def run_all(
+    jobs: Sequence[_J], folder: Path, *, processes: int = 1, dask: str | None = None
+) -> Iterator[tuple[_J, Record | Source]]:
+    """Run pieces of work and give each with its result, in any order.
+
+    Args:
+        folder: where files and records go; with ``dask`` all workers must see it under this path.
+        processes: on this machine; 1 works in this process.
+        dask: address of a Dask scheduler, instead of processes here.
+    Raises: MapError and ConfigError of the pieces; MapError if a worker dies; ConfigError without Dask.
+    """
+    if not jobs:
+        return
+    if dask is not None:
+        yield from _on_dask(jobs, folder, dask)
+    elif processes <= 1 or len(jobs) == 1:
+        for job in jobs:
+            yield job, run_job(job, folder)
+    else:
+        yield from _in_processes(jobs, folder, min(processes, len(jobs)))
+
+
+def _in_processes(jobs: Sequence[_J], folder: Path, processes: int) -> Iterator[tuple[_J, Record | Source]]:
+    # Spawned: a fork would copy GDAL's and OpenCV's locks in whatever state they are.
+    pool = ProcessPoolExecutor(processes, get_context("spawn"), initializer=_start_worker, initargs=(os.getpid(),))
+    try:
+        waiting = iter(jobs)
+        running: dict[Future[Any], _J] = {}
+        for job in waiting:
+            running[pool.submit(_guarded, job, folder)] = job
+            if len(running) < 2 * processes:
+                continue
+            yield from _collected(running)
+        while running:
+            yield from _collected(running)
+    except BrokenProcessPool as err:
+        raise MapError("a process of the build died, perhaps for lack of memory; use fewer: --jobs 1") from err
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _collected(running: dict[Future[Any], _J]) -> Iterator[tuple[_J, Record | Source]]:
+    for future in wait(running, return_when=FIRST_COMPLETED).done:
+        job = running.pop(future)
+        yield job, _unpacked(future.result())
+
+
+def _on_dask(jobs: Sequence[_J], folder: Path, address: str) -> Iterator[tuple[_J, Record | Source]]:
+    try:
+        from dask.distributed import Client, as_completed
+    except ImportError as err:
+        raise ConfigError("--dask needs Dask; install it with: pip install 'ortholoc-edge[dask]'") from err
+    try:
+        client = Client(address, timeout="10s", set_as_default=False)
+    except (OSError, ValueError) as err:
+        raise ConfigError(f"--dask {address}: no scheduler answers ({err}); start one with: dask scheduler") from err
+    with client:
+        _check_shared(client, folder, address)
+        futures = {client.submit(_guarded, job, folder, key=f"{job_name(job)}", pure=False): job for job in jobs}
+        try:
+            for future in as_completed(list(futures)):
+                if future.status != "finished":
+                    raise MapError(f"--dask {address}: a task failed ({future.exception()}); see the workers' logs")
+                yield futures.pop(future), _unpacked(future.result())
+        finally:
+            client.cancel(list(futures))
+
+
+def _check_shared(client: Any, folder: Path, address: str) -> None:
+    probe = folder / f".shared.{os.getpid()}"
+    probe.touch()
+    try:
+        seen = client.run(Path.exists, probe)
+    except (ImportError, AttributeError, ValueError) as err:
+        raise ConfigError(f"--dask {address}: workers do not answer ({err})") from err
+    finally:
+        probe.unlink()
+    if not seen:
+        raise ConfigError(f"--dask {address}: the scheduler has no workers; start some with: dask worker {address}")
+    blind = sorted(worker for worker, there in seen.items() if not there)
+    if blind:
+        raise ConfigError(
+            f"--dask {address}: worker {blind[0]} does not see {folder}; sources and output must lie on a file system"
+            " that all workers share, under one path"
+        )
+
+
+def _start_worker(parent: int) -> None:
+    if sys.platform == "linux":
+        # A worker must not live on when the build is killed.
+        import ctypes
+
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:
+            os._exit(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _guarded(job: Job, folder: Path) -> Record | Source | tuple[str, str]:
+    """Errors as values: those of libraries may not survive the way through a pipe."""
+    cv2.setNumThreads(1)
+    try:
+        with rasterio.Env(GDAL_CACHEMAX=_WORKER_CACHE_BYTES, GDAL_NUM_THREADS="1"):
+            return run_job(job, folder)
+    except ConfigError as err:
+        return "config", str(err)
+    except OrtholocError as err:
+        return "map", str(err)
+    except MemoryError:
+        return "map", "a piece of the build ran out of memory; use fewer processes: --jobs 1"
+    except Exception:
+        return "map", f"a piece of the build failed unexpectedly, please report it:\n{traceback.format_exc()}"
+
+
+def _unpacked(result: Any) -> Record | Source:
+    if isinstance(result, tuple):
+        kind, message = result
+        raise ConfigError(message) if kind == "config" else MapError(message)
+    assert isinstance(result, Record | Source), "a job gives a record or a source"
+    return result
