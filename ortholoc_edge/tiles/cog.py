@@ -9,7 +9,8 @@ from __future__ import annotations
 import threading
 import warnings
 import zlib
-from collections.abc import Iterator
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -29,13 +30,20 @@ from ortholoc_edge.geometry.grid import RasterGrid
 
 BLOCK_PX = 512
 
+# An open level holds one decoded block of its own besides GDAL's cache: 0.8 MB of DOP, 1 MB of DSM. A view lies in
+# at most 4 tiles of each of the two; two levels of them are at hand when a search changes its scale.
+MAX_HANDLES = 16
 
-class MapDamagedError(MapError):
-    """The bytes of a tile that was asked for differ from those of the build."""
+# Of a pixel: what the sums of coordinates of millions of metres may be off.
+_PLACE_SLACK_PX = 1e-3
+
+
+class UndecodableError(MapError):
+    """GDAL cannot decode what was asked for."""
 
 
 class Block(NamedTuple):
-    """A tile of one level; ``column`` and ``row`` count tiles."""
+    """A block of one level; ``column`` and ``row`` count blocks."""
 
     level: int
     column: int
@@ -43,7 +51,7 @@ class Block(NamedTuple):
 
 
 class PixelWindow(NamedTuple):
-    """A block of pixels of one level."""
+    """A rectangle of pixels of one level."""
 
     column: int
     row: int
@@ -51,47 +59,55 @@ class PixelWindow(NamedTuple):
     height: int
 
 
-class Cog:
-    """Random access to a COG's levels from several threads.
+class Handles:
+    """Open GDAL datasets of a set of COGs, at most ``limit``: the one used longest ago is closed first.
 
-    A rasterio handle serves one thread at a time, hence the lock; decoding one window takes milliseconds.
+    A dataset serves one thread at a time and may be closed for another, hence one lock for all; decoding one
+    window takes milliseconds.
     """
 
-    def __init__(self, data: bytes, path: Path) -> None:
-        """Open a file that was read to memory; ``path`` is for messages.
+    def __init__(self, limit: int = MAX_HANDLES) -> None:
+        self.lock = threading.RLock()
+        self._limit = limit
+        self._open: OrderedDict[tuple[int, int], Any] = OrderedDict()
 
-        Raises: MapError if it is no tiled GeoTIFF of ours.
+    def __len__(self) -> int:
+        return len(self._open)
+
+    def get(self, cog: Cog, level: int) -> Any:
+        """A dataset of one level; to be used under ``lock`` only. Raises: MapError, UndecodableError."""
+        key = id(cog), level
+        dataset = self._open.get(key)
+        if dataset is None:
+            while len(self._open) >= self._limit:
+                self._open.popitem(last=False)[1].close()
+            dataset = self._open[key] = cog.open_level(level)
+        self._open.move_to_end(key)
+        return dataset
+
+    def forget(self, cog: Cog) -> None:
+        """Close what is open of a COG."""
+        with self.lock:
+            for key in [key for key in self._open if key[0] == id(cog)]:
+                self._open.pop(key).close()
+
+
+class Cog:
+    """Random access to a COG's levels from several threads. Nothing is opened before it is asked for."""
+
+    def __init__(self, data: bytes, path: Path, handles: Handles | None = None) -> None:
+        """
+        Args:
+            data: the file; not copied.
+            path: for messages.
+            handles: shared with other COGs.
         """
         self.path = path
         self._data = data
-        self._lock = threading.Lock()
-        self._damaged: frozenset[Block] = frozenset()
-        self._levels: list[Any] = []
-        try:
-            self._memory = MemoryFile(data)
-        except (RasterioError, OSError) as err:
-            raise MapError(f"{path}: cannot be opened ({err}); rebuild the pack or copy it again") from err
-        try:
-            with quiet_georeference():
-                full = self._memory.open()
-                self._levels.append(full)
-                for level in range(len(full.overviews(1))):
-                    self._levels.append(self._memory.open(overview_level=level))
-            if full.block_shapes[0] != (BLOCK_PX, BLOCK_PX):
-                raise MapError(
-                    f"{path}: blocks of {full.block_shapes[0]} px, expected {BLOCK_PX}; rebuild the pack"
-                )
-            # The overviews share the extent of the full resolution; where their size is rounded (DOP down,
-            # DSM up), their pixels are a trifle larger or smaller than 2^k of the full ones.
-            grid = raster_grid(full, path)
-            self.grids = (grid, *(grid.resized(one.width, one.height) for one in self._levels[1:]))
-        except (RasterioError, OSError) as err:
-            self.close()
-            raise MapError(f"{path}: cannot be read ({err}); rebuild the pack or copy it again") from err
-        except MapError:
-            self.close()
-            raise
-        self.nodata = full.nodata
+        self._handles = handles or Handles()
+        self._grids: tuple[RasterGrid, ...] | None = None
+        self._nodata: float | None = None
+        self._memory: MemoryFile | None = MemoryFile(data)
 
     def __enter__(self) -> Cog:
         return self
@@ -102,50 +118,88 @@ class Cog:
         self.close()
 
     def close(self) -> None:
-        with self._lock:
-            for level in self._levels:
-                level.close()
-            self._levels = []
-            self._memory.close()
+        with self._handles.lock:
+            self._handles.forget(self)
+            if self._memory is not None:
+                self._memory.close()
+            self._memory = None
+
+    @property
+    def grids(self) -> tuple[RasterGrid, ...]:
+        """Grids of the levels, finest first. Raises: MapError if it is no tiled GeoTIFF of ours."""
+        if self._grids is None:
+            with self._handles.lock:
+                full = self._handles.get(self, 0)
+                if full.block_shapes[0] != (BLOCK_PX, BLOCK_PX):
+                    raise MapError(f"{self.path}: blocks of {full.block_shapes[0]} px, expected {BLOCK_PX}")
+                grids = [raster_grid(full, self.path)]
+                for level in range(len(full.overviews(1))):
+                    size = self._handles.get(self, level + 1).shape
+                    grids.append(grids[0].resized(size[1], size[0]))
+            self._grids = tuple(grids)
+        return self._grids
+
+    @property
+    def crs(self) -> Any:
+        """rasterio's CRS, or None."""
+        with self._handles.lock:
+            return self._handles.get(self, 0).crs
+
+    def require(self, grids: Sequence[RasterGrid], dtypes: Sequence[str], nodata: float | None) -> None:
+        """Check that this is the raster it is taken for; of the overviews, that they are there.
+
+        Raises: MapError naming what differs.
+        """
+        with self._handles.lock:
+            full = self._handles.get(self, 0)
+            if full.dtypes != tuple(dtypes) or full.block_shapes[0] != (BLOCK_PX, BLOCK_PX):
+                raise MapError(
+                    f"{self.path}: bands of {full.dtypes} in blocks of {full.block_shapes[0]},"
+                    f" expected {tuple(dtypes)} of {BLOCK_PX}; rebuild the pack"
+                )
+            if nodata is not None and full.nodata != nodata:
+                raise MapError(f"{self.path}: nodata {full.nodata}, expected {nodata}; rebuild the pack")
+            found, levels = raster_grid(full, self.path), 1 + len(full.overviews(1))
+        if not _same_place(found, grids[0]) or levels != len(grids):
+            raise MapError(
+                f"{self.path}: {levels} levels of {found}, expected {len(grids)} of {grids[0]}; rebuild the pack"
+            )
+        # What a level's size is, is seen when it is read.
+        self._grids = tuple(grids)
 
     def read_image(self, level: int, window: PixelWindow) -> tuple[ImageArray, BoolArray]:
-        """RGB (H, W, 3) uint8 and validity (H, W) of a window inside the level."""
+        """RGB (3, H, W) uint8 and validity (H, W) of a window inside the level."""
         bands, mask = self._read(level, window, with_mask=True)
-        return np.ascontiguousarray(np.moveaxis(bands, 0, -1)), mask > 0
+        return bands, mask > 0
 
     def read_heights(self, level: int, window: PixelWindow) -> Float32Array:
         """Heights (H, W) float32 of a window inside the level, NaN where there is no data."""
         heights: Float32Array = self._read(level, window, with_mask=False)[0][0]
         # Exact: nodata is the lowest value of its LERC block, and LERC stores a block's lowest value as it is.
-        heights[heights == np.float32(self.nodata)] = np.nan
+        heights[heights == self._dsm_nodata()] = np.nan
         return heights
 
     def blocks(self) -> Iterator[Block]:
-        """All tiles of all levels."""
+        """All blocks of all levels."""
         for level, grid in enumerate(self.grids):
-            for row in range(-(-grid.height // BLOCK_PX)):
-                for column in range(-(-grid.width // BLOCK_PX)):
-                    yield Block(level, column, row)
-
-    def block_window(self, block: Block) -> PixelWindow:
-        grid = self.grids[block.level]
-        column, row = block.column * BLOCK_PX, block.row * BLOCK_PX
-        return PixelWindow(column, row, min(BLOCK_PX, grid.width - column), min(BLOCK_PX, grid.height - row))
+            yield from touched(level, PixelWindow(0, 0, grid.width, grid.height))
 
     def undecodable(self) -> list[Block]:
-        """Tiles that GDAL cannot decode."""
+        """Blocks that GDAL cannot decode."""
         bad = []
         for block in self.blocks():
+            grid = self.grids[block.level]
             try:
-                self._read(block.level, self.block_window(block), with_mask=True)
-            except MapError:
+                window = within(block, PixelWindow(0, 0, grid.width, grid.height))
+                self._read(block.level, window, with_mask=True)
+            except UndecodableError:
                 bad.append(block)
         return bad
 
     def segment_crcs(self) -> list[int]:
-        """CRC-32 of the file's head and of each tile's bytes, in the order of the file.
+        """CRC-32 of the file's head and of each block's bytes, in the order of the file.
 
-        A tile's segment runs to the start of the next one, so that the mask which a COG interleaves with its
+        A block's segment runs to the start of the next one, so that the mask which a COG interleaves with its
         image is counted in, and every byte of the file belongs to one segment.
         """
         view = memoryview(self._data)
@@ -153,56 +207,87 @@ class Cog:
         return [zlib.crc32(view[start:end]) for start, end in pairwise(bounds)]
 
     def locate_damage(self, crcs: list[int]) -> frozenset[Block]:
-        """Tiles whose bytes differ from those of the build; later reads that touch one raise MapDamagedError.
+        """Blocks whose bytes differ from those of the build.
 
         Raises: MapError if the file's head is damaged, because then nothing in it can be trusted.
         """
         found = self.segment_crcs()
         if len(found) != len(crcs) or found[0] != crcs[0]:
-            raise MapError(f"{self.path}: the file's head is damaged; rebuild the pack or copy it again")
+            raise MapError(f"{self.path}: the file's head is damaged; copy the pack again")
         in_order = sorted(self._offsets().items(), key=lambda item: item[1])
-        self._damaged = frozenset(
+        return frozenset(
             block for (block, _), was, now in zip(in_order, crcs[1:], found[1:], strict=True) if was != now
         )
-        return self._damaged
+
+    def open_level(self, level: int) -> Any:
+        """A rasterio dataset of one level, to be closed by the caller. Raises: MapError, UndecodableError."""
+        if self._memory is None:
+            raise MapError(f"{self.path}: already closed; open the pack again")
+        try:
+            with quiet_georeference():
+                return self._memory.open() if level == 0 else self._memory.open(overview_level=level - 1)
+        except (RasterioError, OSError) as err:
+            raise UndecodableError(f"{self.path}: cannot be opened ({err}); copy the pack again") from err
+
+    def _dsm_nodata(self) -> np.float32:
+        """Raises: MapError without one: then holes could not be told from heights."""
+        if self._nodata is None:
+            with self._handles.lock:
+                self._nodata = self._handles.get(self, 0).nodata
+            if self._nodata is None:
+                raise MapError(f"{self.path}: names no nodata value; rebuild the pack")
+        return np.float32(self._nodata)
 
     def _offsets(self) -> dict[Block, int]:
         offsets = {}
-        with self._lock:
+        with self._handles.lock:
+            full = self._handles.get(self, 0)
             for block in self.blocks():
-                item = self._levels[0].get_tag_item(
-                    f"BLOCK_OFFSET_{block.column}_{block.row}",
-                    "TIFF",
-                    bidx=1,
-                    ovr=block.level - 1 if block.level else None,
-                )
+                name = f"BLOCK_OFFSET_{block.column}_{block.row}"
+                item = full.get_tag_item(name, "TIFF", bidx=1, ovr=block.level - 1 if block.level else None)
                 if item is not None:
                     offsets[block] = int(item)
         return offsets
 
     def _read(self, level: int, window: PixelWindow, *, with_mask: bool) -> tuple[Any, Any]:
-        if self._damaged:
-            touched = sorted(self._damaged.intersection(_touched(level, window)))
-            if touched:
-                raise MapDamagedError(f"{self.path}: {describe(touched[0])} is damaged; copy the pack again")
         area = Window(window.column, window.row, window.width, window.height)
-        with self._lock:
-            if not self._levels:
-                raise MapError(f"{self.path}: already closed; open the pack again")
-            dataset = self._levels[level]
+        with self._handles.lock:
+            # The grids first: to find them opens levels, which may close this one.
+            grid = self.grids[level]
+            dataset = self._handles.get(self, level)
+            if dataset.shape != (grid.height, grid.width):
+                raise UndecodableError(
+                    f"{self.path}: level {level} has {dataset.shape[1]} x {dataset.shape[0]} px, expected"
+                    f" {grid.width} x {grid.height}; rebuild the pack"
+                )
             try:
                 bands = dataset.read(window=area)
                 mask = dataset.read_masks(1, window=area) if with_mask else None
             except (RasterioError, OSError) as err:
-                raise MapDamagedError(
+                raise UndecodableError(
                     f"{self.path}: level {level} cannot be decoded at pixel ({window.column}, {window.row}) ({err});"
                     " copy the pack again"
                 ) from err
         return bands, mask
 
 
+def touched(level: int, window: PixelWindow) -> Iterator[Block]:
+    """Blocks that a window of a level has pixels of."""
+    for row in range(window.row // BLOCK_PX, (window.row + window.height - 1) // BLOCK_PX + 1):
+        for column in range(window.column // BLOCK_PX, (window.column + window.width - 1) // BLOCK_PX + 1):
+            yield Block(level, column, row)
+
+
+def within(block: Block, window: PixelWindow) -> PixelWindow:
+    """The part of a window that lies in a block that it touches."""
+    column, row = max(block.column * BLOCK_PX, window.column), max(block.row * BLOCK_PX, window.row)
+    right = min((block.column + 1) * BLOCK_PX, window.column + window.width)
+    lower = min((block.row + 1) * BLOCK_PX, window.row + window.height)
+    return PixelWindow(column, row, right - column, lower - row)
+
+
 def describe(block: Block) -> str:
-    return f"tile at column {block.column}, row {block.row} of level {block.level}"
+    return f"block at column {block.column}, row {block.row} of level {block.level}"
 
 
 def raster_grid(dataset: Any, path: Path) -> RasterGrid:
@@ -212,13 +297,9 @@ def raster_grid(dataset: Any, path: Path) -> RasterGrid:
     """
     t = dataset.transform
     if t.b != 0 or t.d != 0:
-        raise MapError(
-            f"{path}: rotated or sheared (affine terms {t.b:g}, {t.d:g}); straighten it with gdalwarp"
-        )
+        raise MapError(f"{path}: rotated or sheared (affine terms {t.b:g}, {t.d:g}); straighten it with gdalwarp")
     if t.is_identity and dataset.crs is None:
-        raise MapError(
-            f"{path}: no georeference; add its world file, or assign it with gdal_translate -a_ullr"
-        )
+        raise MapError(f"{path}: no georeference; add its world file, or assign it with gdal_translate -a_ullr")
     try:
         return RasterGrid(dataset.width, dataset.height, t.c, t.f, t.a, t.e)
     except ValueError as err:
@@ -250,7 +331,14 @@ def set_block_cache(limit_bytes: int) -> None:
         set_gdal_config("GDAL_CACHEMAX", limit_bytes)
 
 
-def _touched(level: int, window: PixelWindow) -> Iterator[Block]:
-    for row in range(window.row // BLOCK_PX, (window.row + window.height - 1) // BLOCK_PX + 1):
-        for column in range(window.column // BLOCK_PX, (window.column + window.width - 1) // BLOCK_PX + 1):
-            yield Block(level, column, row)
+def _same_place(found: RasterGrid, wanted: RasterGrid) -> bool:
+    if (found.width, found.height) != (wanted.width, wanted.height):
+        return False
+    slack = _PLACE_SLACK_PX * wanted.dx
+    off = (
+        found.west - wanted.west,
+        found.top - wanted.top,
+        (found.dx - wanted.dx) * wanted.width,
+        (found.dy - wanted.dy) * wanted.height,
+    )
+    return max(map(abs, off)) <= slack

@@ -9,7 +9,10 @@ an operation that demonstrably used a grid, or from a figure that the user state
 
 from __future__ import annotations
 
+import logging
+import math
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
@@ -26,6 +29,8 @@ from pyproj.transformer import TransformerGroup
 from ortholoc_edge.errors import ConfigError, MapError
 from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.rigid import Rigid3
+
+logger = logging.getLogger(__name__)
 
 # Mean Earth radius (IUGG). The local radius differs by up to 0.4 %, which at a height of 5 km moves the scale
 # by 3e-6.
@@ -59,7 +64,8 @@ VerticalKind = Literal["ellipsoid", "orthometric", "unknown"]
 class VerticalDatum(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What a height in the pack is measured from, and what to add to get the two heights others mean.
 
-    One offset serves a whole pack: the geoid slopes by some centimetres per kilometre.
+    The offsets are those at the pack's anchor. The geoid slopes by some centimetres per kilometre, so that over a
+    large pack others hold elsewhere: see `HeightOffsets`.
 
     Attributes:
         kind: "ellipsoid" (WGS 84 or ETRS89), "orthometric" (a national or global sea level), "unknown".
@@ -99,12 +105,63 @@ class VerticalDatum(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     def _offset(self, offset_m: float | None, wanted: str) -> float:
         if offset_m is None:
-            raise MapError(
-                f"area pack: heights {wanted} cannot be told from its vertical datum ({self.kind});"
-                " rebuild it with --vertical ellipsoid|orthometric and --geoid-undulation-m METRES"
-                " (geoid above ellipsoid there)"
-            )
+            raise self.unknown(wanted)
         return offset_m
+
+    def unknown(self, wanted: str) -> MapError:
+        """The error that heights of a kind ("above the ellipsoid") cannot be told."""
+        return MapError(
+            f"area pack: heights {wanted} cannot be told from its vertical datum ({self.kind});"
+            " rebuild it with --vertical ellipsoid|orthometric and --geoid-undulation-m METRES"
+            " (geoid above ellipsoid there)"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeightOffsets:
+    """The offsets of `VerticalDatum`, tile by tile.
+
+    Between the centres of tiles they are interpolated bilinearly, where a neighbour is missing with the weights of
+    those that are there: without steps as long as one lies within a tile's side. Farther off the nearest tile
+    counts. A tile at the rim of the pack counts as a whole one: half a tile is 0.4 km, of the geoid some 2 cm.
+
+    Attributes:
+        west, top: map coordinates of the north-west corner of tile (0, 0), m.
+        side_m: of a tile.
+        amsl, ellipsoid: offsets in m by (column, row), counted in tiles eastward and southward; either may be empty.
+    """
+
+    west: float
+    top: float
+    side_m: float
+    amsl: Mapping[tuple[int, int], float]
+    ellipsoid: Mapping[tuple[int, int], float]
+
+    def amsl_minus_map_m(self, x: float, y: float) -> float | None:
+        """What to add to a map height for AMSL (EGM96); None if no tile says."""
+        return self._at(self.amsl, x, y)
+
+    def ellipsoid_minus_map_m(self, x: float, y: float) -> float | None:
+        """What to add to a map height for the height above the WGS 84 ellipsoid; None if no tile says."""
+        return self._at(self.ellipsoid, x, y)
+
+    def _at(self, offsets: Mapping[tuple[int, int], float], x: float, y: float) -> float | None:
+        if not offsets:
+            return None
+        # Centres at integers.
+        column, row = (x - self.west) / self.side_m - 0.5, (self.top - y) / self.side_m - 0.5
+        left, upper = math.floor(column), math.floor(row)
+        total = weights = 0.0
+        for key in ((left, upper), (left + 1, upper), (left, upper + 1), (left + 1, upper + 1)):
+            offset = offsets.get(key)
+            if offset is not None:
+                weight = (1.0 - abs(column - key[0])) * (1.0 - abs(row - key[1]))
+                total, weights = total + weight * offset, weights + weight
+        if weights > 0.0:
+            return total / weights
+        keys = np.array(list(offsets), dtype=np.float64)
+        nearest = int(np.hypot(*(keys - (column, row)).T).argmin())
+        return list(offsets.values())[nearest]
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,12 +225,14 @@ class Georeference:
             is 0, scale is 1, and geodetic conversions raise MapError.
         vertical: datum of the pack's heights.
         anchor: (easting, northing) in the area, m; picks the datum transformation that is valid there.
+        offsets: of heights, by place; where they say nothing those of ``vertical`` hold everywhere.
     Raises: MapError for a system that cannot carry poses: geographic, not in metres, not conformal, unreadable.
     """
 
     crs: str | None
     vertical: VerticalDatum
     anchor: tuple[float, float]
+    offsets: HeightOffsets | None = None
     _proj: Any = field(init=False, repr=False)
     _geodetic_from_map: Any = field(init=False, repr=False)
 
@@ -197,8 +256,8 @@ class Georeference:
         """Position on WGS 84 of a map point (3,): easting, northing, height in m."""
         x, y, z = np.asarray(points_map, dtype=np.float64)
         lon_deg, lat_deg = self._transform(float(x), float(y), "FORWARD")
-        vertical, height_m = self.vertical, float(z)
-        ellipsoid, amsl = vertical.ellipsoid_minus_map_m, vertical.amsl_minus_map_m
+        height_m = float(z)
+        ellipsoid, amsl = self.ellipsoid_minus_map_m((x, y)), self.amsl_minus_map_m((x, y))
         return Geodetic(
             lat_deg,
             lon_deg,
@@ -223,11 +282,26 @@ class Georeference:
             raise ValueError("map_from_geodetic takes exactly one of height_amsl_m and height_ellipsoid_m")
         x, y = self._transform(lon_deg, lat_deg, "INVERSE")
         if height_amsl_m is not None:
-            z = self.vertical.map_from_amsl(height_amsl_m)
+            height_m, offset_m, wanted = height_amsl_m, self.amsl_minus_map_m((x, y)), "above mean sea level"
         else:
             assert height_ellipsoid_m is not None
-            z = self.vertical.map_from_ellipsoid(height_ellipsoid_m)
-        return np.array([x, y, z])
+            height_m, offset_m = height_ellipsoid_m, self.ellipsoid_minus_map_m((x, y))
+            wanted = "above the ellipsoid"
+        if offset_m is None:
+            raise self.vertical.unknown(wanted)
+        return np.array([x, y, height_m - offset_m])
+
+    def amsl_minus_map_m(self, xy_map: npt.ArrayLike) -> float | None:
+        """What to add to a map height at a map position (2,) for AMSL (EGM96), m; None: not known."""
+        x, y = np.asarray(xy_map, dtype=np.float64)
+        offset = None if self.offsets is None else self.offsets.amsl_minus_map_m(float(x), float(y))
+        return self.vertical.amsl_minus_map_m if offset is None else offset
+
+    def ellipsoid_minus_map_m(self, xy_map: npt.ArrayLike) -> float | None:
+        """What to add to a map height at a map position (2,) for the height above WGS 84, m; None: not known."""
+        x, y = np.asarray(xy_map, dtype=np.float64)
+        offset = None if self.offsets is None else self.offsets.ellipsoid_minus_map_m(float(x), float(y))
+        return self.vertical.ellipsoid_minus_map_m if offset is None else offset
 
     def convergence_rad(self, xy_map: npt.ArrayLike) -> float:
         """Angle from true north to grid north at a map position, clockwise positive.
@@ -341,16 +415,29 @@ def derive_vertical(
     geoid_undulation_m: float | None,
     lat_lon_deg: tuple[float, float] | None,
 ) -> VerticalDatum:
-    """Vertical datum with its two offsets, at one place of the area.
+    """`derive_offsets` at one place; None for a local frame, where PROJ cannot help."""
+    places = None if lat_lon_deg is None else np.array([lat_lon_deg])
+    return derive_offsets(kind, epsg, geoid_undulation_m, places)[0]
 
-    Offsets come from PROJ where it has the geoid grid, else from the undulation that the user stated. Heights
-    above a sea level whose grid is missing are taken as AMSL: the national zeros lie within 0.2-1 m of
-    EGM96's (NAVD88: 1-2 m); the derivation says so and ``amsl_sigma_m`` has the figure.
+
+def derive_offsets(
+    kind: VerticalKind,
+    epsg: int | None,
+    geoid_undulation_m: float | None,
+    lat_lon_deg: npt.ArrayLike | None,
+) -> tuple[VerticalDatum, FloatArray | None, FloatArray | None]:
+    """Vertical datum with its two offsets, over an area.
+
+    Offsets come from PROJ where it has the geoid grid for all of the area, else from the undulation that the user
+    stated. Heights above a sea level whose grid is missing are taken as AMSL, with a warning: the national zeros
+    lie within 0.2-1 m of EGM96's (NAVD88: 1-2 m); the derivation says so and ``amsl_sigma_m`` has the figure.
     Args:
         geoid_undulation_m: height of the geoid above the ellipsoid in the area, m.
-        lat_lon_deg: place; None for a local frame, where PROJ cannot help.
-    Raises: ConfigError for values that contradict each other; MapError for an EPSG code that is no vertical
-        system in metres.
+        lat_lon_deg: (N, 2) places, the anchor first; None for a local frame, where PROJ cannot help.
+    Returns: the datum with the offsets at the first place; (N,) ``amsl_minus_map_m`` at the places; (N,)
+        ``ellipsoid_minus_map_m``. The arrays are None where the datum's value is, and for a local frame.
+    Raises: ConfigError for values that contradict each other, and for heights above the ellipsoid whose geoid
+        neither PROJ nor the user knows; MapError for an EPSG code that is no vertical system in metres.
     """
     if kind == "unknown":
         if geoid_undulation_m is not None or epsg is not None:
@@ -358,78 +445,113 @@ def derive_vertical(
                 "--geoid-undulation-m and --vertical-epsg say nothing without the kind of heights; add"
                 " --vertical ellipsoid or --vertical orthometric"
             )
-        return VerticalDatum(kind="unknown", derivation="not stated when the pack was built")
+        return VerticalDatum(kind="unknown", derivation="stated as unknown when the pack was built"), None, None
     if geoid_undulation_m is not None and not abs(geoid_undulation_m) <= _MAX_UNDULATION_M:
         raise ConfigError(
             f"--geoid-undulation-m {geoid_undulation_m}: beyond +-{_MAX_UNDULATION_M:.0f} m, where no geoid is;"
             " state the height of the geoid above the ellipsoid in metres"
         )
-    amsl_minus_ellipsoid = _grid_offset("EPSG:4979", f"EPSG:4326+{_EGM96_EPSG}", lat_lon_deg)
+    places = None if lat_lon_deg is None else np.asarray(lat_lon_deg, dtype=np.float64).reshape(-1, 2)
+    amsl_minus_ellipsoid = _grid_offsets("EPSG:4979", f"EPSG:4326+{_EGM96_EPSG}", places)
     if kind == "ellipsoid":
-        if epsg is not None:
-            raise ConfigError("--vertical-epsg names a sea level; it goes with --vertical orthometric")
-        _check_undulation(geoid_undulation_m, amsl_minus_ellipsoid)
-        derivation, sigma_m = "geoid EGM96 through PROJ", _GRID_SIGMA_M
-        if amsl_minus_ellipsoid is None and geoid_undulation_m is not None:
-            amsl_minus_ellipsoid = -geoid_undulation_m
-            derivation, sigma_m = f"geoid {geoid_undulation_m:+.2f} m above the ellipsoid, as stated", 0.0
-        return VerticalDatum(
-            kind="ellipsoid",
-            name="WGS 84 ellipsoid",
-            amsl_minus_map_m=amsl_minus_ellipsoid,
-            ellipsoid_minus_map_m=0.0,
-            derivation=derivation if amsl_minus_ellipsoid is not None else "no geoid grid in PROJ, none stated",
-            amsl_sigma_m=None if amsl_minus_ellipsoid is None else sigma_m,
-        )
-    name = None if epsg is None else _vertical_name(epsg)
-    ellipsoid_minus_map = None if epsg is None else _grid_offset(f"EPSG:4326+{epsg}", "EPSG:4979", lat_lon_deg)
-    if ellipsoid_minus_map is not None:
-        _check_undulation(geoid_undulation_m, -ellipsoid_minus_map)
-    if ellipsoid_minus_map is not None and amsl_minus_ellipsoid is not None:
-        amsl, derivation = ellipsoid_minus_map + amsl_minus_ellipsoid, f"{name} and EGM96 through PROJ"
-        sigma_m = 0.0 if epsg == _EGM96_EPSG else _GRID_SIGMA_M
-    elif epsg == _EGM96_EPSG:
-        amsl, sigma_m, derivation = 0.0, 0.0, "heights are EGM96's own"
+        return _of_ellipsoid(epsg, geoid_undulation_m, amsl_minus_ellipsoid, places)
+    return _of_sea_level(epsg, geoid_undulation_m, amsl_minus_ellipsoid, places)
+
+
+def _of_ellipsoid(
+    epsg: int | None, stated_m: float | None, amsl_minus_ellipsoid: FloatArray | None, places: FloatArray | None
+) -> tuple[VerticalDatum, FloatArray | None, FloatArray | None]:
+    if epsg is not None:
+        raise ConfigError("--vertical-epsg names a sea level; it goes with --vertical orthometric")
+    _check_undulation(stated_m, amsl_minus_ellipsoid)
+    if amsl_minus_ellipsoid is not None:
+        amsl_m, sigma_m, derivation = float(amsl_minus_ellipsoid[0]), _GRID_SIGMA_M, "geoid EGM96 through PROJ"
+    elif stated_m is not None:
+        amsl_m, sigma_m = -stated_m, 0.0
+        derivation = f"geoid {stated_m:+.2f} m above the ellipsoid, as stated"
+        amsl_minus_ellipsoid = _everywhere(amsl_m, places)
     else:
-        amsl, derivation = 0.0, "its zero taken as EGM96's, which is true to about 1 m (NAVD88: 2 m)"
-        sigma_m = _NAVD88_SIGMA_M if epsg == _NAVD88_EPSG else _ZERO_LEVEL_SIGMA_M
-    if ellipsoid_minus_map is None and geoid_undulation_m is not None:
-        ellipsoid_minus_map = geoid_undulation_m
-        derivation += f"; geoid {geoid_undulation_m:+.2f} m above the ellipsoid, as stated"
-    return VerticalDatum(
-        kind="orthometric",
-        name=name,
-        epsg=epsg,
-        amsl_minus_map_m=amsl,
-        ellipsoid_minus_map_m=ellipsoid_minus_map,
+        raise ConfigError(
+            "heights are above the ellipsoid, and the geoid there is not known: state it with --geoid-undulation-m"
+            " METRES (geoid above ellipsoid), or give PROJ its grid: us_nga_egm96_15.tif in the folder PROJ_DATA,"
+            " or projsync --file us_nga_egm96_15.tif"
+        )
+    datum = VerticalDatum(
+        kind="ellipsoid",
+        name="WGS 84 ellipsoid",
+        amsl_minus_map_m=amsl_m,
+        ellipsoid_minus_map_m=0.0,
         derivation=derivation,
         amsl_sigma_m=sigma_m,
     )
+    return datum, amsl_minus_ellipsoid, _everywhere(0.0, places)
 
 
-def _grid_offset(source: str, target: str, lat_lon_deg: tuple[float, float] | None) -> float | None:
-    """Target height minus source height, m, by an operation that uses a grid; None if PROJ has no such.
+def _of_sea_level(
+    epsg: int | None, stated_m: float | None, amsl_minus_ellipsoid: FloatArray | None, places: FloatArray | None
+) -> tuple[VerticalDatum, FloatArray | None, FloatArray | None]:
+    name = None if epsg is None else _vertical_name(epsg)
+    ellipsoid = None if epsg is None else _grid_offsets(f"EPSG:4326+{epsg}", "EPSG:4979", places)
+    amsl: FloatArray | None
+    if ellipsoid is not None:
+        _check_undulation(stated_m, -ellipsoid)
+    if ellipsoid is not None and amsl_minus_ellipsoid is not None:
+        amsl, derivation = ellipsoid + amsl_minus_ellipsoid, f"{name} and EGM96 through PROJ"
+        sigma_m = 0.0 if epsg == _EGM96_EPSG else _GRID_SIGMA_M
+    elif epsg == _EGM96_EPSG:
+        amsl, sigma_m, derivation = _everywhere(0.0, places), 0.0, "heights are EGM96's own"
+    else:
+        amsl = _everywhere(0.0, places)
+        derivation = "its zero taken as EGM96's, which is true to about 1 m (NAVD88: 2 m)"
+        sigma_m = _NAVD88_SIGMA_M if epsg == _NAVD88_EPSG else _ZERO_LEVEL_SIGMA_M
+        logger.warning(
+            "%s: PROJ has no geoid grid that leads to EGM96, so heights are taken as AMSL, good to %g m (1 sigma)",
+            name or "heights above a sea level that is not named", sigma_m,
+        )  # fmt: skip
+    ellipsoid_m = None if ellipsoid is None else float(ellipsoid[0])
+    if ellipsoid is None and stated_m is not None:
+        ellipsoid_m, ellipsoid = stated_m, _everywhere(stated_m, places)
+        derivation += f"; geoid {stated_m:+.2f} m above the ellipsoid, as stated"
+    datum = VerticalDatum(
+        kind="orthometric",
+        name=name,
+        epsg=epsg,
+        amsl_minus_map_m=0.0 if amsl is None else float(amsl[0]),
+        ellipsoid_minus_map_m=ellipsoid_m,
+        derivation=derivation,
+        amsl_sigma_m=sigma_m,
+    )
+    return datum, amsl, ellipsoid
+
+
+def _everywhere(offset_m: float, places: FloatArray | None) -> FloatArray | None:
+    return None if places is None else np.full(len(places), offset_m)
+
+
+def _grid_offsets(source: str, target: str, places: FloatArray | None) -> FloatArray | None:
+    """Target height minus source height, m, at places (N, 2) as latitude and longitude, by one operation that uses a
+    grid; None if PROJ has none that covers them all.
 
     PROJ falls back to leaving the height alone, and tells only in the operation's metadata; hence the choice
     by grids here instead of taking what `Transformer.from_crs` gives.
     """
-    if lat_lon_deg is None:
+    if places is None:
         return None
-    lat, lon = lat_lon_deg
+    lat, lon = places.T
     group = _group(source, target, lon, lat)
     for transformer in group.transformers:
         operations = transformer.operations or ()
         grids = [grid for operation in operations for grid in operation.grids]
         if not grids or not all(grid.available for grid in grids):
             continue
-        height = transformer.transform(lon, lat, 0.0)[2]
-        if np.isfinite(height):
-            return float(height)
+        heights = np.asarray(transformer.transform(lon, lat, np.zeros(len(lon)))[2], dtype=np.float64)
+        if np.isfinite(heights).all():
+            return heights
     return None
 
 
-def _group(source: CRS | str, target: str, lon: float, lat: float) -> TransformerGroup:
-    """PROJ's ways between two systems at a place, best first, without those that pretend."""
+def _group(source: CRS | str, target: str, lon: npt.ArrayLike, lat: npt.ArrayLike) -> TransformerGroup:
+    """PROJ's ways between two systems over some places, best first, without those that pretend."""
     # A grid fetched from the network today would be missing on the next build; the pack would differ.
     set_network_enabled(active=False)
     with warnings.catch_warnings():
@@ -437,12 +559,14 @@ def _group(source: CRS | str, target: str, lon: float, lat: float) -> Transforme
         return TransformerGroup(source, target, always_xy=True, area_of_interest=_area(lon, lat), allow_ballpark=False)
 
 
-def _check_undulation(stated_m: float | None, amsl_minus_ellipsoid: float | None) -> None:
+def _check_undulation(stated_m: float | None, amsl_minus_ellipsoid: FloatArray | None) -> None:
+    """At the first place: over a large area the geoid itself may move by more than the tolerance."""
     if stated_m is None or amsl_minus_ellipsoid is None:
         return
-    if abs(stated_m + amsl_minus_ellipsoid) > _MAX_UNDULATION_DISAGREEMENT_M:
+    found_m = -float(amsl_minus_ellipsoid[0])
+    if abs(stated_m - found_m) > _MAX_UNDULATION_DISAGREEMENT_M:
         raise ConfigError(
-            f"--geoid-undulation-m {stated_m:+.2f}: PROJ's geoid lies {-amsl_minus_ellipsoid:+.2f} m above"
+            f"--geoid-undulation-m {stated_m:+.2f}: PROJ's geoid lies {found_m:+.2f} m above"
             " the ellipsoid here; correct the value (the sign is geoid above ellipsoid) or leave it out"
         )
 
@@ -507,12 +631,13 @@ def _wgs84_transformer(crs: CRS, proj: Any, anchor: tuple[float, float]) -> Tran
         ) from err
 
 
-def _area(lon: float, lat: float) -> Any:
+def _area(lon: npt.ArrayLike, lat: npt.ArrayLike) -> Any:
+    lon, lat = np.asarray(lon), np.asarray(lat)
     return AreaOfInterest(
-        max(lon - _AREA_MARGIN_DEG, -180.0),
-        max(lat - _AREA_MARGIN_DEG, -90.0),
-        min(lon + _AREA_MARGIN_DEG, 180.0),
-        min(lat + _AREA_MARGIN_DEG, 90.0),
+        max(float(lon.min()) - _AREA_MARGIN_DEG, -180.0),
+        max(float(lat.min()) - _AREA_MARGIN_DEG, -90.0),
+        min(float(lon.max()) + _AREA_MARGIN_DEG, 180.0),
+        min(float(lat.max()) + _AREA_MARGIN_DEG, 90.0),
     )
 
 

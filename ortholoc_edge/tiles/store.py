@@ -6,6 +6,7 @@ the cache limit, whatever the area, and no read touches the disk in flight.
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from math import ceil, floor, isfinite, sqrt
 from types import TracebackType
@@ -16,16 +17,18 @@ import numpy.typing as npt
 from ortholoc_edge.errors import MapError
 from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.grid import RasterGrid, bilinear
-from ortholoc_edge.tiles.cog import BLOCK_PX, Cog, PixelWindow, describe, set_block_cache
-from ortholoc_edge.tiles.manifest import RasterFile
+from ortholoc_edge.tiles.cog import BLOCK_PX, Handles, PixelWindow, set_block_cache
+from ortholoc_edge.tiles.lattice import Bounds
+from ortholoc_edge.tiles.layer import LoadedLayer, read_listed
+from ortholoc_edge.tiles.manifest import FeatureTile, FileNote
 from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.window import MapWindow
 
 logger = logging.getLogger(__name__)
 
-Bounds = tuple[float, float, float, float]
-
 CACHE_BYTES = 64 * 2**20
+# Of compressed files: about 190 km2 at 4 MB per km2.
+MEMORY_BYTES = 768 * 2**20
 
 # 16 Mpx of RGB and mask are 64 MB; a localizer works on 0.3-1 Mpx.
 MAX_PIXELS = 16_000_000
@@ -39,10 +42,16 @@ _EDGE_SLACK_PX = 1e-6
 _GROUND_REACH_M = (20.0, 80.0, 320.0)
 
 
+class WindowTooLargeError(MapError):
+    """A read would give more pixels than a store may return at once."""
+
+
 class MapStore:
     """DOP and DSM of a pack, in memory. Safe to read from several threads.
 
-    The cache limit is the process's: GDAL has one block cache, and the store opened last sets its size.
+    A tile that is missing, or damaged, is a hole: no data, as where the survey had none; a damaged tile of which
+    only some blocks are bad has holes there. The cache limit is the process's: GDAL has one block cache, and the
+    store opened last sets its size.
     """
 
     def __init__(
@@ -50,27 +59,52 @@ class MapStore:
         pack: Pack,
         *,
         cache_bytes: int = CACHE_BYTES,
+        memory_bytes: int = MEMORY_BYTES,
         max_pixels: int = MAX_PIXELS,
-        tolerate_damage: bool = False,
+        features: bool = False,
+        require_intact: bool = False,
     ) -> None:
-        """Read the files to memory and check their SHA-256.
+        """Read the files to memory and check their SHA-256; each that is damaged gives one warning.
 
         Args:
             cache_bytes: limit of decoded blocks.
+            memory_bytes: limit of the compressed files, which all are held.
             max_pixels: largest raster that one read may return.
-            tolerate_damage: open a pack with damaged tiles; a read that touches one raises MapDamagedError.
-                The pack's tile checksums tell which they are.
-        Raises: MapError naming the damaged or missing file.
+            features: hold the precomputed features too, if the pack has any.
+            require_intact: refuse a pack with holes by damage.
+        Raises: MapError for a pack over ``memory_bytes``, before anything is read; for one without any usable tile
+            of DOP or DSM; for a damaged one if it must be intact.
         """
         self.pack = pack
         self.max_pixels = max_pixels
+        manifest = pack.manifest
+        feature_tiles = manifest.features.tiles if features and manifest.features is not None else []
+        notes: list[FileNote] = [*manifest.dop.tiles, *manifest.dsm.tiles, *feature_tiles]
+        self._compressed_bytes = sum(note.bytes for note in notes)
+        if self._compressed_bytes > memory_bytes:
+            raise MapError(
+                f"{pack.path}: {self._compressed_bytes / 2**20:.0f} MiB to be held in memory,"
+                f" {memory_bytes / 2**20:.0f} MiB are allowed; rebuild the pack with a smaller --area or with"
+                f" --max-size, or raise map.memory_mb"
+            )
         set_block_cache(cache_bytes)
-        self._dop = _load(pack, pack.manifest.dop, tolerate_damage)
+        handles = Handles()
+        self._dop = LoadedLayer(manifest.dop, pack.path, handles, pack.missing)
         try:
-            self._dsm = _load(pack, pack.manifest.dsm, tolerate_damage)
-        except MapError:
+            self._dsm = LoadedLayer(manifest.dsm, pack.path, handles, pack.missing)
+        except BaseException:
             self._dop.close()
             raise
+        self._features: dict[int, bytes] = {}
+        self._damaged_features: list[str] = []
+        for tile in feature_tiles:
+            self._load_features(tile)
+        if require_intact and self.damaged:
+            self.close()
+            raise MapError(
+                f"{pack.path}: {len(self.damaged)} damaged or missing files, the first {self.damaged[0]}; copy the"
+                " pack again, or allow holes with map.require_intact = false"
+            )
 
     def __enter__(self) -> MapStore:
         return self
@@ -84,40 +118,47 @@ class MapStore:
         """Free the memory; later reads raise MapError."""
         self._dop.close()
         self._dsm.close()
+        self._features = {}
+
+    @property
+    def damaged(self) -> list[str]:
+        """Files of the pack that are holes or have some, because they are missing or damaged."""
+        return [*self._dop.damaged, *self._dsm.damaged, *self._damaged_features]
 
     @property
     def bounds(self) -> Bounds:
-        """(west, south, east, north) of the DOP, m."""
+        """(west, south, east, north) of the box that holds the DOP's tiles, m."""
         return self._dop.grids[0].bounds
 
     @property
     def compressed_bytes(self) -> int:
         """Bytes of the preloaded files."""
-        return sum(entry.bytes for entry in self.pack.rasters)
+        return self._compressed_bytes
 
     @property
     def dop_grids(self) -> tuple[RasterGrid, ...]:
-        """Grids of the DOP's levels, finest first."""
+        """Grids of the DOP's levels over its bounds, finest first."""
         return self._dop.grids
 
     @property
     def dsm_grids(self) -> tuple[RasterGrid, ...]:
-        """Grids of the DSM's levels, finest first."""
+        """Grids of the DSM's levels over the box that holds its tiles, finest first."""
         return self._dsm.grids
 
     def read(self, bounds_map: Bounds, gsd_m: float, dsm_gsd_m: float | None = None) -> MapWindow | None:
         """The map in a region, on the grids of the levels that fit; nothing is resampled.
 
         The DOP comes from the coarsest level that is no coarser than ``gsd_m * sqrt(2)``, the DSM from the
-        coarsest that is no coarser than ``dsm_gsd_m``; the finest if none is. Both are cropped to the map;
-        the DSM reaches one cell beyond the DOP's window, for bilinear look-ups.
+        coarsest that is no coarser than ``dsm_gsd_m``; the finest if none is. Both are cropped to the layers' boxes;
+        the DSM reaches one cell beyond the DOP's window, for bilinear look-ups. Pixels without a tile are invalid
+        or NaN, as those for which a tile has no data.
         Args:
             bounds_map: (west, south, east, north), m.
             gsd_m: wanted ground sampling distance of the DOP.
             dsm_gsd_m: of the DSM; by default twice that of the DOP's chosen level.
         Returns: None where the region holds no pixel of the DOP or none of the DSM.
-        Raises: MapError for a window over ``max_pixels``; MapDamagedError for one that touches a damaged
-            tile; ValueError for bounds or a GSD that are no such.
+        Raises: WindowTooLargeError for a window over ``max_pixels``; MapError after `close`; ValueError for bounds
+            or a GSD that are no such.
         """
         west, south, east, north = bounds_map
         if not (all(map(isfinite, bounds_map)) and west < east and south < north):
@@ -135,7 +176,7 @@ class MapStore:
             return None
         for name, size in (("DOP", window), ("DSM", dsm_window)):
             if size.width * size.height > self.max_pixels:
-                raise MapError(
+                raise WindowTooLargeError(
                     f"{name} window of {size.width} x {size.height} px exceeds {self.max_pixels} px;"
                     " ask for a smaller region or a larger gsd_m"
                 )
@@ -144,6 +185,11 @@ class MapStore:
         for array in (dop, valid, dsm):
             array.flags.writeable = False
         return MapWindow(dop, valid, dop_grid, dsm, self._dsm.grids[dsm_level].crop(*dsm_window))
+
+    def feature_bytes(self, dop_index: int) -> bytes | None:
+        """File with the features of a tile of the DOP, by its index in the manifest; its SHA-256 was checked. None
+        if the tile has none, they were not asked for, or the file is damaged."""
+        return self._features.get(dop_index)
 
     def ground_near(self, xy_map: npt.ArrayLike) -> float | None:
         """Typical height of the surface around a map position (2,), m: the median over 20 m to each side, over
@@ -179,23 +225,22 @@ class MapStore:
             heights[rows[own]] = bilinear(raster, px[rows[own]] - (column, row))
         return heights
 
-
-def _load(pack: Pack, entry: RasterFile, tolerate_damage: bool) -> Cog:
-    cog, intact = pack.load(entry)
-    if intact:
-        return cog
-    try:
-        if not tolerate_damage:
-            raise MapError(
-                f"{cog.path}: SHA-256 differs from the manifest; rebuild the pack or copy it again"
-            )
-        damaged = sorted(cog.locate_damage(entry.crcs()))
-    except MapError:
-        cog.close()
-        raise
-    first = describe(damaged[0]) if damaged else "none that a read would touch"
-    logger.warning("%s: damaged, %d tiles cannot be used (first: %s)", cog.path, len(damaged), first)
-    return cog
+    def _load_features(self, tile: FeatureTile) -> None:
+        try:
+            if tile.file in self.pack.missing:
+                raise MapError(f"{self.pack.path / tile.file}: missing; copy the pack again")
+            if tile.dop_sha256 != self.pack.manifest.dop.tiles[tile.dop].sha256:
+                raise MapError(
+                    f"{self.pack.path / tile.file}: features of another orthophoto than the pack's; rebuild the pack"
+                )
+            data = read_listed(self.pack.path / tile.file, tile)
+            if hashlib.sha256(data).hexdigest() != tile.sha256:
+                raise MapError(f"{self.pack.path / tile.file}: SHA-256 differs from the manifest; copy the pack again")
+        except MapError as err:
+            logger.warning("%s; its tile is flown without precomputed features", err)
+            self._damaged_features.append(tile.file)
+            return
+        self._features[tile.dop] = data
 
 
 def _coarsest(grids: tuple[RasterGrid, ...], limit_m: float) -> int:
