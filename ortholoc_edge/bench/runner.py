@@ -134,7 +134,7 @@ def sample_store(sample: sequence.Sample) -> Iterator[MapStore]:
                     target.write(bands)
             except rasterio.errors.RasterioError as err:
                 raise MapError(f"{sample.name}: can't write {file} ({err}); is the disk full?") from err
-        pack = build_pack(dop, dsm, folder / "pack", PackOptions(quality=95))
+        pack = build_pack(dop, dsm, folder / "pack", PackOptions(quality=95, vertical="unknown"))
         with MapStore(pack) as store:
             yield store
 

@@ -126,7 +126,7 @@ def _measure(one: _Set, matchers: Mapping[str, Matcher], scratch: Path, args: ar
 def _store(one: _Set, scratch: Path) -> MapStore | None:
     if one.dop is None or one.dsm is None:
         return None
-    return MapStore(build_pack(one.dop, one.dsm, scratch / one.name, PackOptions()))
+    return MapStore(build_pack(one.dop, one.dsm, scratch / one.name, PackOptions(quality=85, vertical="unknown")))
 
 
 def _rows(

@@ -35,6 +35,7 @@ from ortholoc_edge.tiles.lattice import CROP_PX, Lattice, PixelBox
 from ortholoc_edge.tiles.manifest import (
     FORMAT,
     MANIFEST_NAME,
+    MOSAIC_NAMES,
     VERSION,
     Alignment,
     Dop,
@@ -642,8 +643,6 @@ class _Build:
                 [_cells(tile, record.matchability) for tile, record in zip(manifest.dop.tiles, dop_cells, strict=True)],
                 [_cells(tile, record.share) for tile, record in zip(manifest.dsm.tiles, dsm_cells, strict=True)],
             ),
-            "dop.vrt": vrt.mosaic(manifest.dop, manifest.crs),
-            "dsm.vrt": vrt.mosaic(manifest.dsm, manifest.crs),
             **stac.stac_files(manifest, georeference),
         }
         notes = []
@@ -652,6 +651,9 @@ class _Build:
             target.parent.mkdir(parents=True, exist_ok=True)
             write_file(target, data)
             notes.append(FileNote(file=file, bytes=len(data), sha256=hashlib.sha256(data).hexdigest()))
+        # Not listed: a GIS writes its statistics into them, and nothing in flight reads them.
+        for layer, file in zip((manifest.dop, manifest.dsm), MOSAIC_NAMES, strict=True):
+            write_file(self._staged / file, vrt.mosaic(layer, manifest.crs))
         return msgspec.structs.replace(manifest, files=notes)
 
     def _checked(self, manifest: Manifest) -> Alignment | None:

@@ -16,6 +16,8 @@ from ortholoc_edge.tiles.lattice import CROP_PX, Bounds, Lattice, PixelBox
 
 MANIFEST_NAME = "manifest.json"
 SIGNATURE_NAME = "manifest.sig"
+# For a GIS, not for flight: not listed, because a GIS writes statistics into them.
+MOSAIC_NAMES = ("dop.vrt", "dsm.vrt")
 FORMAT = "ortholoc-pack"
 VERSION = 2
 
@@ -206,7 +208,7 @@ class Manifest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         vertical: with the offsets at the anchor; the DSM's tiles have them each.
         features: precomputed, or None.
         alignment: of DOP and DSM, or None.
-        files: everything else in the folder: mosaics for a GIS, STAC, reports.
+        files: everything else in the folder but the mosaics: STAC, reports.
     """
 
     format: str

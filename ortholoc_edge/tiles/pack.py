@@ -19,6 +19,7 @@ from ortholoc_edge.tiles.georeference import Georeference, HeightOffsets
 from ortholoc_edge.tiles.layer import check_listed, read_listed
 from ortholoc_edge.tiles.manifest import (
     MANIFEST_NAME,
+    MOSAIC_NAMES,
     SIGNATURE_NAME,
     Dop,
     Dsm,
@@ -154,7 +155,9 @@ class Pack:
     def _unlisted(self, listed: set[str]) -> list[str]:
         found = (path for path in self.path.rglob("*") if path.is_symlink() or not path.is_dir())
         names = (path.relative_to(self.path).as_posix() for path in found)
-        return sorted(name for name in names if name not in listed and name not in (MANIFEST_NAME, SIGNATURE_NAME))
+        known = {*listed, MANIFEST_NAME, SIGNATURE_NAME, *MOSAIC_NAMES}
+        # A GIS leaves statistics beside what it has shown.
+        return sorted(name for name in names if name not in known and not name.endswith(".aux.xml"))
 
 
 def _offsets(dsm: Dsm) -> HeightOffsets:

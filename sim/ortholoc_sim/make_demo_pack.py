@@ -81,7 +81,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--force", action="store_true", help="replace a pack that is there")
     options = parser.parse_args(arguments)
     make_demo_pack(options.out, options.force)
-    size = sum(f.stat().st_size for f in options.out.iterdir())
+    size = sum(f.stat().st_size for f in options.out.rglob("*") if f.is_file())
     sys.stderr.write(f"{options.out}: {size / 1e6:.2f} MB\n")
     return 0
 
