@@ -76,14 +76,17 @@ class MountOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 class MapOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Which area pack, and how much memory its decoded tiles may take.
+    """Which area pack, and how much memory it may take.
 
-    ``tolerate_damage``: fly with a pack that has damaged tiles; frames over one give no fix.
+    ``memory_mb``: limit of its compressed files, which all are held; a larger pack is refused at the start.
+    ``cache_mb``: limit of decoded blocks besides.
+    ``require_intact``: refuse a pack with missing or damaged files instead of flying with holes in the map.
     """
 
     pack: str
     cache_mb: Annotated[int, Meta(ge=1)] = 64
-    tolerate_damage: bool = False
+    memory_mb: Annotated[int, Meta(ge=1)] = 768
+    require_intact: bool = False
 
 
 class MatcherOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -137,7 +137,8 @@ class Daemon:
                 MapStore(
                     Pack.open(Path(config.map.pack)),
                     cache_bytes=config.map.cache_mb * 2**20,
-                    tolerate_damage=config.map.tolerate_damage,
+                    memory_bytes=config.map.memory_mb * 2**20,
+                    require_intact=config.map.require_intact,
                 )
             )
             self._georeference = self._store.pack.georeference
@@ -174,6 +175,7 @@ class Daemon:
         self._last_fix_ns: int | None = None
         self._counts: Counter[str] = Counter()
         self._origin_missing = False
+        self._damage_reported = 0
         self._origin: GeodeticOrigin | None = None
         self._last_status_ns = 0
 
@@ -186,6 +188,7 @@ class Daemon:
         return {
             **self._counts,
             "frames_replaced": self._slot.replaced,
+            "map_files_damaged": len(self._store.damaged),
             "log_dropped": 0 if self._recorder is None else self._recorder.dropped,
             "bus_dropped": 0 if self._bus is None else self._bus.dropped,
             **{f"link.{name}": value for name, value in self._link.statistics().items()},
@@ -209,8 +212,9 @@ class Daemon:
             resources.callback(systemd.notify, "STOPPING=1")
             systemd.notify("READY=1")
             logger.info(
-                "running: pack %s, matcher %s, solver %s", self._config.map.pack, self._matcher.name, pnp.SOLVER
-            )
+                "running: pack %s (%.0f MB in memory), matcher %s, solver %s",
+                self._config.map.pack, self._store.compressed_bytes / 1e6, self._matcher.name, pnp.SOLVER,
+            )  # fmt: skip
             self._work(stop)
         if self._capture_failure is not None:
             raise CameraError(f"the camera thread ended: {self._capture_failure}") from self._capture_failure
@@ -396,9 +400,20 @@ class Daemon:
             status = TrackerStatus.COAST
         self._link.set_system_status(SystemStatus.ACTIVE if fresh else SystemStatus.STANDBY)
         systemd.notify(f"STATUS={status}, {self._counts['fixes']} fixes, {self._counts['rejected']} rejected")
+        if self._link.connected():
+            self._report_damage()
         if self._origin_missing and self._link.connected():
             self._link.send_status_text(Severity.WARNING, "OrthoLoC: EKF origin unknown, fixes not sent")
             self._origin_missing = False
+
+    def _report_damage(self) -> None:
+        """Say that the map has holes: once the autopilot is there, and again if more are found in flight."""
+        damaged = self._store.damaged
+        if len(damaged) == self._damage_reported:
+            return
+        self._damage_reported = len(damaged)
+        logger.warning("holes in the map: %d files are damaged or missing, the last %s", len(damaged), damaged[-1])
+        self._link.send_status_text(Severity.WARNING, f"OrthoLoC: {len(damaged)} map files damaged")
 
 
 def vision_estimate(
@@ -440,9 +455,8 @@ def _require_flyable(georeference: Georeference, pack: str) -> None:
             f"{pack}: has no reference system, so its positions mean nothing to an autopilot; rebuild it from rasters "
             "in a projected system"
         )
-    try:
-        georeference.vertical.amsl_from_map(0.0)
-    except MapError as err:
+    if georeference.amsl_minus_map_m(georeference.anchor) is None:
         raise MapError(
-            f"{pack}: {err} Until then a fix could be wrong by the height of the geoid, 30 to 50 m."
-        ) from err
+            f"{pack}: {georeference.vertical.unknown('above mean sea level')} Until then a fix could be wrong by the"
+            " height of the geoid, 30 to 50 m."
+        )

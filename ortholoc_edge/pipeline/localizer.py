@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 from msgspec import Meta, Struct, field
 
-from ortholoc_edge.errors import MapError
 from ortholoc_edge.geometry import homography
 from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
 from ortholoc_edge.geometry.camera import Camera
@@ -38,7 +37,7 @@ from ortholoc_edge.pose import calibrate, pnp
 from ortholoc_edge.pose.lift import lift
 from ortholoc_edge.tiles.georeference import LocalFrame
 from ortholoc_edge.tiles.manifest import Manifest
-from ortholoc_edge.tiles.store import MapStore
+from ortholoc_edge.tiles.store import MapStore, WindowTooLargeError
 from ortholoc_edge.tiles.window import MapWindow
 
 # Paper, "Initial Camera Calibration / Localization": matches below are dropped, where the matcher has one.
@@ -155,9 +154,8 @@ class Localizer:
             return self._localize(frame, prior, proceed, trace)
         except _RejectedError as stop:
             return Rejected(frame.stamp_ns, stop.reason, stop.detail, stop.measured, stop.limit, trace.timings_ms())
-        except MapError as error:
-            # One damaged tile must not end the flight: elsewhere the pack is good.
-            return Rejected(frame.stamp_ns, Reason.MAP_DAMAGED, str(error), timings_ms=trace.timings_ms())
+        except WindowTooLargeError as error:
+            return Rejected(frame.stamp_ns, Reason.PRIOR_TOO_WIDE, str(error), timings_ms=trace.timings_ms())
 
     def _localize(self, frame: Frame, prior: PosePrior | RegionPrior, proceed: Callable[[], bool], trace: Trace) -> Fix:
         grey = self._checked_grey(frame)

@@ -18,8 +18,7 @@ class Reason(StrEnum):
     BAD_ATTITUDE = "bad_attitude"  # NaN or missing attitude from the autopilot
     PRIOR_TOO_WIDE = "prior_too_wide"  # the search would cover more map than may be read
     OUTSIDE_MAP = "outside_map"  # the predicted view does not meet the pack
-    MAP_NODATA = "map_nodata"  # the pack has no DOP or no DSM there
-    MAP_DAMAGED = "map_damaged"  # a tile of the pack can't be decoded
+    MAP_NODATA = "map_nodata"  # the pack has no DOP or no DSM there, or lost it by damage
     FEW_MATCHES = "few_matches"
     FEW_INLIERS = "few_inliers"
     LOW_INLIER_RATIO = "low_inlier_ratio"

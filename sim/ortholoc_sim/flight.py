@@ -40,6 +40,7 @@ from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
 from ortholoc_edge.pipeline.navigator import TimingOptions
 from ortholoc_edge.pipeline.outcome import Fix, Outcome
+from ortholoc_edge.tiles.manifest import layer_bounds
 from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.store import MapStore
 from ortholoc_sim import demo_pack_path
@@ -464,7 +465,7 @@ def _along(points: FloatArray, step_m: float) -> FloatArray:
 
 
 def _placement(pack: Pack, site: Site, spec: WorldSpec) -> Placement:
-    west, south, east, north = pack.manifest.dop.grid.raster_grid().bounds
+    west, south, east, north = layer_bounds(pack.manifest.dop)
     if abs(east - west - spec.width_m) > 1.0 or abs(north - south - spec.height_m) > 1.0:
         raise MapError(
             f"area pack {pack.path}: {east - west:.0f} x {north - south:.0f} m, the generated world has "
