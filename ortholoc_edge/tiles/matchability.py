@@ -19,12 +19,13 @@ from typing import Final
 
 import cv2
 import numpy as np
+from rasterio import Affine
 from rasterio.io import MemoryFile
-from rasterio.transform import from_origin
 
 from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, ImageArray
+from ortholoc_edge.tiles.coverage import PRESENT_PERCENT, layer_cells, shares_on
 from ortholoc_edge.tiles.lattice import CROP_PX
-from ortholoc_edge.tiles.manifest import Manifest, layer_box
+from ortholoc_edge.tiles.manifest import Manifest
 
 # Of the mean score over a frame's footprint: from the first on a match is expected, from the second it is doubtful,
 # below it is not to be counted on. Of 343 quarters of real frames, altered like a year-old map's would be, a
@@ -111,23 +112,17 @@ def matchability_tif(manifest: Manifest, dop_cells: Sequence[ImageArray], dsm_sh
     Returns: uint8, DEFLATE, nodata 255, which is also where a cell's centre has no surface model. Equal input
         gives equal bytes.
     """
-    lattice, box = manifest.dop.lattice, layer_box(manifest.dop.tiles)
-    cells_map = np.full((box.height // CROP_PX, box.width // CROP_PX), NO_MAP, dtype=np.uint8)
-    for tile, values in zip(manifest.dop.tiles, dop_cells, strict=True):
-        row, column = (tile.row - box.row) // CROP_PX, (tile.column - box.column) // CROP_PX
-        cells_map[row : row + values.shape[0], column : column + values.shape[1]] = values
-    grid = lattice.grid(box)
-    side_m = lattice.pixel_m * CROP_PX
-    known = _surface_known(manifest, dsm_shares, cells_map.shape, (grid.west, grid.top), side_m)
-    cells_map[~known] = NO_MAP
+    values, grid = layer_cells(manifest.dop, dop_cells, empty=NO_MAP)
+    shares, dsm_grid = layer_cells(manifest.dsm, dsm_shares)
+    values[shares_on(shares, dsm_grid, grid) < PRESENT_PERCENT] = NO_MAP
     profile = {
         "driver": "GTiff",
-        "width": cells_map.shape[1],
-        "height": cells_map.shape[0],
+        "width": grid.width,
+        "height": grid.height,
         "count": 1,
         "dtype": "uint8",
         "crs": manifest.crs,
-        "transform": from_origin(grid.west, grid.top, side_m, side_m),
+        "transform": Affine(grid.dx, 0.0, grid.west, 0.0, grid.dy, grid.top),
         "nodata": NO_MAP,
         "compress": "deflate",
         "tiled": True,
@@ -136,35 +131,9 @@ def matchability_tif(manifest: Manifest, dop_cells: Sequence[ImageArray], dsm_sh
     }
     with MemoryFile() as memory:
         with memory.open(**profile) as raster:
-            raster.write(cells_map, 1)
+            raster.write(values, 1)
             raster.set_band_description(1, "matchability, 0 to 100")
         return bytes(memory.read())
-
-
-def _surface_known(
-    manifest: Manifest,
-    dsm_shares: Sequence[ImageArray],
-    shape: tuple[int, ...],
-    corner: tuple[float, float],
-    side_m: float,
-) -> BoolArray:
-    """Where the centre of a cell of a grid from ``corner`` (west, north) has a surface model."""
-    lattice, box = manifest.dsm.lattice, layer_box(manifest.dsm.tiles)
-    step = lattice.pixel_m * CROP_PX
-    shares = np.zeros((box.height // CROP_PX, box.width // CROP_PX), dtype=np.uint8)
-    for tile, values in zip(manifest.dsm.tiles, dsm_shares, strict=True):
-        row, column = (tile.row - box.row) // CROP_PX, (tile.column - box.column) // CROP_PX
-        shares[row : row + values.shape[0], column : column + values.shape[1]] = values
-    grid = lattice.grid(box)
-    east = corner[0] + side_m * (np.arange(shape[1]) + 0.5)
-    north = corner[1] - side_m * (np.arange(shape[0]) + 0.5)
-    columns = np.floor((east - grid.west) / step).astype(np.intp)
-    rows = np.floor((grid.top - north) / step).astype(np.intp)
-    on_columns = (columns >= 0) & (columns < shares.shape[1])
-    on_rows = (rows >= 0) & (rows < shares.shape[0])
-    known = np.zeros(shape, dtype=bool)
-    known[np.ix_(on_rows, on_columns)] = shares[np.ix_(rows[on_rows], columns[on_columns])] > 0
-    return known
 
 
 def _measure(grey: ImageArray, valid: BoolArray) -> FloatArray:
