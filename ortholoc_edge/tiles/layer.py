@@ -49,19 +49,23 @@ class LoadedLayer:
         damaged: files that are holes or have some, in the order in which that was found.
     """
 
-    def __init__(self, layer: Dop | Dsm, folder: Path, handles: Handles, missing: frozenset[str]) -> None:
+    def __init__(
+        self, layer: Dop | Dsm, folder: Path, handles: Handles, missing: frozenset[str], *, salvage: bool = True
+    ) -> None:
         """Read the tiles to memory and check their SHA-256.
 
         Args:
             handles: that the layers of a store share.
             missing: files that are not there; their tiles are holes and were reported.
+            salvage: use the blocks of a damaged tile whose CRC-32 is right. Not where the pack is signed: to a
+                forged block a CRC-32 can be made to fit.
         Raises: MapError if not one tile can be used.
         """
         self._lattice = layer.lattice
         self._box = layer_box(layer.tiles)
         self.grids = tuple(layer.lattice.grid(self._box, level) for level in range(layer.lattice.levels))
         self.damaged: list[str] = []
-        self._handles = handles
+        self._handles, self._salvage = handles, salvage
         self._nodata = layer.nodata if isinstance(layer, Dsm) else None
         self._dtypes = ("float32",) if isinstance(layer, Dsm) else ("uint8",) * 3
         self._held: dict[tuple[int, int], _Held] = {}
@@ -213,6 +217,8 @@ class LoadedLayer:
         if hashlib.sha256(data).hexdigest() == note.sha256:
             return held
         try:
+            if not self._salvage:
+                raise MapError(f"{path}: SHA-256 differs from the signed manifest; copy the pack again")
             self._require(held)
             held.damaged = held.cog.locate_damage(note.crcs())
             if not held.damaged:

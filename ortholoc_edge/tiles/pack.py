@@ -27,8 +27,10 @@ from ortholoc_edge.tiles.manifest import (
     Manifest,
     Tile,
     layer_box,
+    parse_manifest,
     read_manifest,
 )
+from ortholoc_edge.tiles.signature import require
 
 logger = logging.getLogger(__name__)
 
@@ -51,22 +53,28 @@ class Pack:
         manifest: as read.
         georeference: of the pack's map frame.
         missing: files that the manifest lists and that are not there, or not with the size it says.
+        signed: whether a signature of the manifest was required and found.
     """
 
     path: Path
     manifest: Manifest
     georeference: Georeference
     missing: frozenset[str] = frozenset()
+    signed: bool = False
 
     @staticmethod
-    def open(path: Path) -> Pack:
+    def open(path: Path, public_key: Path | None = None) -> Pack:
         """Read the manifest and look at the files; their contents are checked by `verify` and by `MapStore`.
 
         A file that is missing or has another size is no error: without a tile there is a hole in the map. All of
         them give one warning.
-        Raises: MapError naming the manifest, the key and the remedy.
+        Args:
+            public_key: that must have signed the manifest, a PEM file; None: no signature is looked for.
+        Raises: MapError naming the manifest, the key and the remedy; ConfigError for an unusable public key.
         """
-        manifest = read_manifest(path / MANIFEST_NAME)
+        file = path / MANIFEST_NAME
+        # What is parsed are the bytes that were verified, not those of a second look at the file.
+        manifest = read_manifest(file) if public_key is None else parse_manifest(require(path, public_key), file)
         problems = {}
         for note in manifest.notes():
             try:
@@ -86,7 +94,7 @@ class Pack:
             georeference = Georeference(manifest.crs, manifest.vertical, manifest.anchor, _offsets(manifest.dsm))
         except ValueError as err:
             raise MapError(f"{path / MANIFEST_NAME}: {err}; rebuild the pack or copy it again") from err
-        return Pack(path, manifest, georeference, frozenset(problems))
+        return Pack(path, manifest, georeference, frozenset(problems), signed=public_key is not None)
 
     @property
     def total_bytes(self) -> int:

@@ -89,9 +89,9 @@ class MapStore:
             )
         set_block_cache(cache_bytes)
         handles = Handles()
-        self._dop = LoadedLayer(manifest.dop, pack.path, handles, pack.missing)
+        self._dop = LoadedLayer(manifest.dop, pack.path, handles, pack.missing, salvage=not pack.signed)
         try:
-            self._dsm = LoadedLayer(manifest.dsm, pack.path, handles, pack.missing)
+            self._dsm = LoadedLayer(manifest.dsm, pack.path, handles, pack.missing, salvage=not pack.signed)
         except BaseException:
             self._dop.close()
             raise

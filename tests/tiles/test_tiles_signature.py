@@ -11,12 +11,14 @@ import sys
 from pathlib import Path
 
 import pytest
-from lattice_tiles import write_pack
+from lattice_tiles import DOP_LATTICE, write_pack
 
 from ortholoc_edge.cli import tiles_sign
 from ortholoc_edge.errors import ConfigError, MapError
 from ortholoc_edge.tiles.manifest import MANIFEST_NAME, SIGNATURE_NAME
+from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.signature import PASSPHRASE_VARIABLE, generate, require, sign, verify_bytes
+from ortholoc_edge.tiles.store import MapStore
 
 pytest.importorskip("cryptography", reason="the extra `sign` is not installed")
 
@@ -117,6 +119,46 @@ def test_what_is_no_pack_is_not_signed(pack, keys):
     with pytest.raises(MapError, match=r"manifest\.json"):
         sign(pack, keys[0])
     assert not (pack / SIGNATURE_NAME).exists()
+
+
+def test_a_pack_is_opened_with_the_bytes_that_were_verified(signed, keys, monkeypatch):
+    sound = (signed / MANIFEST_NAME).read_bytes()
+
+    def swapped(*arguments):
+        verify_bytes(*arguments)
+        change_manifest(signed)
+
+    monkeypatch.setattr("ortholoc_edge.tiles.signature.verify_bytes", swapped)
+    assert Pack.open(signed, keys[1]).manifest.dsm.tiles[0].max_m == 407.0
+    assert (signed / MANIFEST_NAME).read_bytes() != sound
+    assert Pack.open(signed).manifest.dsm.tiles[0].max_m == 408.0
+
+
+def test_an_unsigned_pack_is_opened_unless_a_key_is_named(pack, keys):
+    assert not Pack.open(pack).signed
+    with pytest.raises(MapError, match="not signed"):
+        Pack.open(pack, keys[1])
+    sign(pack, keys[0])
+    assert Pack.open(pack, keys[1]).signed
+
+
+def test_of_a_changed_tile_in_a_signed_pack_nothing_is_used(signed, keys):
+    tile = Pack.open(signed).manifest.dop.tiles[0]
+    path = signed / tile.file
+    data = bytearray(path.read_bytes())
+    # The last block is of the full resolution; the CRC-32 of the overviews is still right, as a forger would have it.
+    data[-8] ^= 1
+    path.write_bytes(data)
+    bounds = DOP_LATTICE.grid(tile.box).bounds
+    gsd_m = 4 * DOP_LATTICE.pixel_m
+    with MapStore(Pack.open(signed)) as store:
+        window = store.read(bounds, gsd_m, 1.0)
+        assert window.dop_valid.any()
+        assert store.damaged == [tile.file]
+    with MapStore(Pack.open(signed, keys[1])) as store:
+        window = store.read(bounds, gsd_m, 1.0)
+        assert window is None or not window.dop_valid.any()
+        assert store.damaged == [tile.file]
 
 
 @needs_openssl
