@@ -7,7 +7,10 @@ data, or what cannot be a height, is not valid. Judgements that need the whole r
 from __future__ import annotations
 
 import hashlib
+import struct
 import warnings
+import zipfile
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -47,8 +50,11 @@ MIN_HEIGHT_M, MAX_HEIGHT_M = -500.0, 9000.0
 _STRETCH_SHARES = (0.005, 0.995)
 _SAMPLE_PX = 1024
 
-# What rasterio, GDAL's bindings and NumPy raise for a damaged file, a file of another format, or absurd sizes.
-READ_ERRORS = (RasterioError, ProjError, OSError, ValueError, LookupError, TypeError, ArithmeticError, MemoryError)
+# What rasterio, PROJ, NumPy, zipfile and laspy raise for a damaged file, a file of another format, or absurd sizes.
+READ_ERRORS = (
+    *(RasterioError, ProjError, OSError, ValueError, LookupError, TypeError, ArithmeticError, MemoryError),
+    *(zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, struct.error),
+)
 
 
 @dataclass(frozen=True, slots=True)

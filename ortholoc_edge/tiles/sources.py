@@ -18,8 +18,10 @@ from rasterio.enums import ColorInterp
 
 from ortholoc_edge.errors import ConfigError, MapError
 from ortholoc_edge.geometry.grid import RasterGrid
+from ortholoc_edge.tiles import points
 from ortholoc_edge.tiles.cog import raster_grid
 from ortholoc_edge.tiles.georeference import vertical_of
+from ortholoc_edge.tiles.prepare import prepare
 from ortholoc_edge.tiles.resample import DopPixels, is_copied, read_dop, read_dsm
 from ortholoc_edge.tiles.source import Kind, Source, Stretch, fingerprint, named_errors, opened, with_common_stretch
 
@@ -30,6 +32,7 @@ __all__ = [
     "discover",
     "fingerprint",
     "is_copied",
+    "prepare",
     "read_dop",
     "read_dsm",
     "with_common_stretch",
@@ -99,7 +102,12 @@ class _NotUsableError(Exception):
 
 
 def discover(
-    paths: Sequence[Path], kind: Kind, *, assign_crs: str | None = None, date: str | None = None
+    paths: Sequence[Path],
+    kind: Kind,
+    *,
+    assign_crs: str | None = None,
+    date: str | None = None,
+    point_cell_m: float | None = None,
 ) -> list[Source]:
     """What of ``paths`` is an orthophoto, or a surface model.
 
@@ -111,6 +119,7 @@ def discover(
         assign_crs: system of files that name none: world files, text. A file's own wins. "local": local
             metres.
         date: of acquisition of all of them; None: what their metadata or names say.
+        point_cell_m: side of the cells that point clouds are gridded to; None: as `points.cloud_grid` chooses.
     Returns: in the order of ``paths``, by name within a folder, each file once.
     Raises: MapError naming the file and the remedy for what is not usable; ConfigError for an unusable ``assign_crs``.
     """
@@ -128,7 +137,7 @@ def discover(
                 usable += 1
                 continue
             try:
-                source = _probe(found, kind, assign_crs, assigned, notes)
+                source = _probe(found, kind, assign_crs, assigned, point_cell_m, notes)
             except _NotUsableError as err:
                 if found.asked:
                     raise MapError(str(err)) from err
@@ -205,12 +214,8 @@ def _searched(path: Path, notes: _Notes) -> Iterator[_Found]:
 
 
 def _members(archive: Path, notes: _Notes) -> list[_Found]:
-    with named_errors(str(archive), "is not a readable ZIP"):
-        try:
-            with zipfile.ZipFile(archive) as opened_zip:
-                infos = [info for info in opened_zip.infolist() if not info.is_dir()]
-        except (zipfile.BadZipFile, NotImplementedError) as err:
-            raise OSError(str(err)) from err
+    with named_errors(str(archive), "is not a readable ZIP"), zipfile.ZipFile(archive) as opened_zip:
+        infos = [info for info in opened_zip.infolist() if not info.is_dir()]
     found, mosaics = [], []
     for info in sorted(infos, key=lambda one: one.filename):
         parts = PurePosixPath(info.filename).parts
@@ -229,7 +234,8 @@ def _members(archive: Path, notes: _Notes) -> list[_Found]:
 
 
 def _known(name: str) -> bool:
-    return PurePosixPath(name.lower()).suffix in _RASTERS
+    name = name.lower()
+    return name.endswith((*_RASTERS, *points.CLOUDS, *points.TEXT, *(f"{suffix}.gz" for suffix in points.TEXT)))
 
 
 def _sidecar(name: str) -> bool:
@@ -240,7 +246,12 @@ def _sidecar(name: str) -> bool:
 # What a file says about itself
 
 
-def _probe(found: _Found, kind: Kind, assign_crs: str | None, assigned: Any, notes: _Notes) -> Source:
+def _probe(
+    found: _Found, kind: Kind, assign_crs: str | None, assigned: Any, cell_m: float | None, notes: _Notes
+) -> Source:
+    name = (found.member or found.file.name).lower().removesuffix(".gz")
+    if name.endswith((*points.CLOUDS, *points.TEXT)) and not _is_ascii_grid(found):
+        return _probe_points(found, name, kind, assign_crs, assigned, cell_m, notes)
     with opened(found.gdal_path, found.where) as dataset:
         _check_size(dataset, found)
         picture = found.suffix in _PICTURES
@@ -255,7 +266,7 @@ def _probe(found: _Found, kind: Kind, assign_crs: str | None, assigned: Any, not
             "path": found.gdal_path,
             "name": found.name,
             "kind": kind,
-            "file": found.file.resolve() if found.member is None else found.file.absolute(),
+            "file": found.file.absolute(),
             "member": found.member,
             "grid": grid,
             **_referenced(found.where, crs, grid, kind),
@@ -266,6 +277,48 @@ def _probe(found: _Found, kind: Kind, assign_crs: str | None, assigned: Any, not
         }
         _check_local(found.where, common["crs"], grid, assign_crs)
         return _probe_dop(dataset, found, common) if kind == "dop" else _probe_dsm(dataset, found, common)
+
+
+def _is_ascii_grid(found: _Found) -> bool:
+    if found.suffix != ".asc":
+        return False
+    with named_errors(found.where), points.stream(found.file, found.member) as source:
+        return bool(source.read(5).lower() in (b"ncols", b"nrows", b"xllco", b"xllce"))
+
+
+def _probe_points(
+    found: _Found, name: str, kind: Kind, assign_crs: str | None, assigned: Any, cell_m: float | None, notes: _Notes
+) -> Source:
+    where = found.where
+    if kind == "dop":
+        raise _NotUsableError(f"{where}: points, expected a picture; give it as --dsm")
+    own = None
+    if name.endswith(points.CLOUDS):
+        cloud = points.cloud_grid(found.file, found.member, where, cell_m)
+        grid, own = cloud.grid, cloud.crs
+    else:
+        layout = points.text_layout(found.file, found.member, where)
+        if layout is None and name.endswith(".txt"):
+            raise _NotUsableError(f"{where}: no table of x, y and z; give text with three columns of numbers")
+        if layout is None:
+            raise MapError(f"{where}: no table of x, y and z; fetch it again")
+        grid = points.text_grid(found.file, found.member, layout, where)
+    crs = _chosen_crs(found, own or _projection_beside(found), True, assign_crs, assigned, notes)
+    if crs is not None and crs.is_geographic:
+        raise MapError(f"{where}: points in degrees; project them first, or give a raster")
+    return Source(
+        path=found.gdal_path,
+        name=found.name,
+        kind=kind,
+        file=found.file.absolute(),
+        member=found.member,
+        grid=grid,
+        **_referenced(where, crs, grid, kind),
+        date=date_of_name(found.member or found.file.name) or date_of_name(found.file.name),
+        bands=(1,),
+        driver="las" if name.endswith(points.CLOUDS) else "xyz",
+        dtype="float32",
+    )
 
 
 def _check_size(dataset: Any, found: _Found) -> None:
