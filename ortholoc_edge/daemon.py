@@ -131,11 +131,12 @@ class Daemon:
         self._config = config
         self._clock = clock or SystemClock()
         self._on_outcome = on_outcome
+        public_key = None if config.map.public_key is None else Path(config.map.public_key)
         with ExitStack() as resources:
             # Closed in reverse, also where a later part can't be had.
             self._store = resources.enter_context(
                 MapStore(
-                    Pack.open(Path(config.map.pack)),
+                    Pack.open(Path(config.map.pack), public_key),
                     cache_bytes=config.map.cache_mb * 2**20,
                     memory_bytes=config.map.memory_mb * 2**20,
                     require_intact=config.map.require_intact,

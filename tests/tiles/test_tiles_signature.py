@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import re
 import shutil
 import stat
 import subprocess
@@ -13,7 +14,7 @@ from pathlib import Path
 import pytest
 from lattice_tiles import DOP_LATTICE, write_pack
 
-from ortholoc_edge.cli import tiles_sign
+from ortholoc_edge.cli import run, tiles_sign
 from ortholoc_edge.errors import ConfigError, MapError
 from ortholoc_edge.tiles.manifest import MANIFEST_NAME, SIGNATURE_NAME
 from ortholoc_edge.tiles.pack import Pack
@@ -159,6 +160,29 @@ def test_of_a_changed_tile_in_a_signed_pack_nothing_is_used(signed, keys):
         window = store.read(bounds, gsd_m, 1.0)
         assert window is None or not window.dop_valid.any()
         assert store.damaged == [tile.file]
+
+
+def test_run_refuses_a_pack_without_the_signature_that_its_configuration_names(pack, keys, tmp_path):
+    example = Path(__file__).parents[2] / "config" / "example.toml"
+    file = tmp_path / "config.toml"
+
+    def start(public_key):
+        lines = [f'public_key = "{public_key}"', f'pack = "{pack}"']
+        text = re.sub(r'^pack = "[^"]*"', "\n".join(lines), example.read_text(encoding="utf-8"), flags=re.MULTILINE)
+        file.write_text(text, encoding="utf-8")
+        return run.run(argparse.Namespace(config=file))
+
+    with pytest.raises(MapError, match="not signed"):
+        start(keys[1])
+    sign(pack, generate(tmp_path / "other")[0])
+    with pytest.raises(MapError, match="another key signed it"):
+        start(keys[1])
+    sign(pack, keys[0])
+    # The next thing that is wrong: no signature any more, but heights that an autopilot can do nothing with.
+    with pytest.raises(MapError, match="mean sea level"):
+        start(keys[1])
+    with pytest.raises(ConfigError, match="public key cannot be read"):
+        start(tmp_path / "absent.pem")
 
 
 @needs_openssl
@@ -320,11 +344,11 @@ def test_the_commands_make_keys_and_sign(pack, tmp_path, capsys):
     parser = argparse.ArgumentParser()
     tiles_sign.add_parser(parser.add_subparsers())
 
-    def run(*arguments):
+    def command(*arguments):
         args = parser.parse_args([str(argument) for argument in arguments])
         assert args.run(args) == 0
         return capsys.readouterr().out.split()
 
-    private, public = run("keygen", "--out", tmp_path / "survey")
-    assert run("sign", pack, "--key", private) == [str(pack / SIGNATURE_NAME)]
+    private, public = command("keygen", "--out", tmp_path / "survey")
+    assert command("sign", pack, "--key", private) == [str(pack / SIGNATURE_NAME)]
     require(pack, Path(public))
