@@ -40,7 +40,6 @@ def dop_cog(
     What is invalid is set to one colour: what a lossy source has there is noise that costs bytes. Quality 100 of
     WEBP is lossless.
     """
-    lossless = {"webp_lossless": "YES"} if compression == "webp" and quality == 100 else {}
     # GDAL's own averaging leaves out masked pixels, so that their colour does not bleed into an overview.
     options: dict[str, Any] = {
         "compress": compression.upper(),
@@ -49,7 +48,6 @@ def dop_cog(
         "overview_count": LEVELS - 1,
         "overview_compress": compression.upper(),
         "overview_quality": quality,
-        **lossless,
     }
     with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), MemoryFile() as work:
         profile = _profile(grid, crs) | {"count": 3, "dtype": "uint8", "photometric": "RGB", "interleave": "pixel"}
