@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -71,14 +72,16 @@ class Sampler:
         self._plan = plan
         self._dop: list[_Sample] = []
         self._dsm: list[_Sample] = []
+        # Preparing looks at all of a source, which many samples may share.
+        prepared = functools.cache(lambda source: prepare(source, folder))
         for index, box in _spread(plan.dop):
             grid = plan.dop.lattice.grid(box)
-            sources = [prepare(plan.dop.sources[k], folder) for k in plan.dop.tiles[index].sources]
+            sources = [prepared(plan.dop.sources[k]) for k in plan.dop.tiles[index].sources]
             picture = dop_mosaic(sources, grid, plan.crs, plan.area)
             self._dop.append((picture.rgb, picture.valid))
         for index, box in _spread(plan.dsm):
             grid = plan.dsm.lattice.grid(box)
-            sources = [prepare(plan.dsm.sources[k], folder) for k in plan.dsm.tiles[index].sources]
+            sources = [prepared(plan.dsm.sources[k]) for k in plan.dsm.tiles[index].sources]
             heights = dsm_mosaic(sources, grid, plan.crs, plan.area).heights
             self._dsm.append((heights[None], np.isfinite(heights)))
 
@@ -89,7 +92,6 @@ class Sampler:
         shrink = (self._plan.dop.lattice.pixel_m / settings.dop_gsd_m) ** 2
         levels = sum(0.25**k for k in range(encode.LEVELS))
         valid = float(np.mean([valid.mean() for _, valid in self._dop]))
-        mpx = self._plan.dop.pixels * valid * shrink * levels / 1e6
         mpx = self._plan.dop.pixels * valid * shrink * levels / 1e6
         features = settings.features_per_mpx * mpx * _BYTES_PER_FEATURE
         tiles = len(self._plan.dop.tiles) * max(shrink, 0.25) + len(self._plan.dsm.tiles)

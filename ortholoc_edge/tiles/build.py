@@ -7,6 +7,7 @@ import logging
 import os
 import re
 import shutil
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -79,6 +80,8 @@ _BUILD_CACHE_BYTES = 256 * 2**20
 # Tiles that the check of DOP against DSM looks at: enough for a consensus, and memory that does not grow with the
 # area.
 _MAX_CHECKED_TILES = 24
+# Below the hidden folder: pieces of work, and sources that were made plain.
+_WORK = "work"
 # A size budget that was missed is tried again at lower quality, this often.
 _MAX_TRIALS = 4
 
@@ -203,7 +206,7 @@ def build_pack(
         _vertical_kind(options, layers[1])
         model_sha256 = None if options.features is None else features.model_of(options.features)
         with _explained(out), work_folder(out) as folder:
-            plan, settings = _settled(layers, options, folder)
+            plan, settings, _ = _settled(layers, options, folder, estimated=False)
             for trial in range(_MAX_TRIALS):
                 staged = _Build(plan, settings, options, model_sha256, folder, workers, say).run()
                 size = sum(path.stat().st_size for path in staged.rglob("*") if path.is_file())
@@ -236,13 +239,12 @@ def preview_build(
     with block_cache(_BUILD_CACHE_BYTES), _explained(out):
         layers = _discovered(_paths(dop), _paths(dsm), options)
         _vertical_kind(options, layers[1])
-        with work_folder(out) as folder:
-            plan = _planned(layers, options)
-            sampler = Sampler(plan, folder)
-            settings = _settings(plan, options)
-            if options.max_size_bytes is not None:
-                return Preview(plan, *settings_within(sampler, settings, options.max_size_bytes))
-            return Preview(plan, settings, sampler.estimate(settings))
+        # Not the build's own folder: what is done there already must outlive this.
+        there = next(folder for folder in out.parents if folder.is_dir())
+        with tempfile.TemporaryDirectory(prefix=f".{out.name}.estimate.", dir=there) as scratch:
+            plan, settings, estimate = _settled(layers, options, Path(scratch))
+            assert estimate is not None, "asked for"
+            return Preview(plan, settings, estimate)
 
 
 def _silent(fraction: float, message: str) -> None:
@@ -310,14 +312,15 @@ def _settings(plan: Plan, options: PackOptions) -> Settings:
 
 
 def _settled(
-    layers: tuple[list[Source], list[Source]], options: PackOptions, folder: Path
-) -> tuple[Plan, Settings]:
-    """The plan, at pixel sizes and quality that fit the size budget."""
+    layers: tuple[list[Source], list[Source]], options: PackOptions, folder: Path, estimated: bool = True
+) -> tuple[Plan, Settings, Estimate | None]:
+    """The plan, at pixel sizes and quality that fit the size budget; with an estimate if there is a budget or one is
+    wanted."""
     plan = _planned(layers, options)
     settings = _settings(plan, options)
     if options.max_size_bytes is None:
-        return plan, settings
-    settings, estimate = settings_within(Sampler(plan, folder), settings, options.max_size_bytes)
+        return plan, settings, Sampler(plan, folder / _WORK).estimate(settings) if estimated else None
+    settings, estimate = settings_within(Sampler(plan, folder / _WORK), settings, options.max_size_bytes)
     logger.info(
         "for %.0f MB: DOP %.3g m/px at quality %d, DSM %.3g m/px within %.3g m, about %.1f MB",
         options.max_size_bytes / 1e6,
@@ -328,7 +331,7 @@ def _settled(
         estimate.bytes / 1e6,
     )
     fitted = replace(options, dop_gsd_m=settings.dop_gsd_m, dsm_gsd_m=settings.dsm_gsd_m)
-    return _planned(layers, fitted), settings
+    return _planned(layers, fitted), settings, estimate
 
 
 def _vertical_kind(options: PackOptions, dsm: Sequence[Source]) -> tuple[VerticalKind, int | None]:
@@ -371,7 +374,7 @@ class _Build:
         self._settings = settings
         self._options = options
         self._model_sha256 = model_sha256
-        self._work = folder / "work"
+        self._work = folder / _WORK
         self._staged = folder / "pack"
         self._workers = workers
         self._say = say

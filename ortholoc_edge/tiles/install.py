@@ -19,6 +19,8 @@ logger = logging.getLogger(__name__)
 
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
+# Records of finished pieces of work, and sources that were made plain.
+_WORTH_KEEPING = (".record", ".tif")
 
 
 @contextmanager
@@ -29,34 +31,57 @@ def work_folder(out: Path) -> Iterator[Path]:
     that an exchange in two steps left without a name is put back first.
     Raises: MapError if it cannot be made or another build has it.
     """
-    folder, aside = out.parent / f".{out.name}.building", _aside(out)
+    folder = out.parent / f".{out.name}.building"
+    handle = _locked(folder, out)
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        if aside.exists():
-            if out.exists():
-                shutil.rmtree(aside)
-            else:
-                logger.warning("%s: put back; a build was cut off while it replaced it", out)
-                aside.rename(out)
-        folder.mkdir(exist_ok=True)
-        handle = os.open(folder, os.O_RDONLY)
-    except OSError as err:
-        raise MapError(f"{folder}: cannot be made ({err.strerror}); check the path and its permissions") from err
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as err:
-            raise MapError(f"{out}: another build is writing this pack; wait for it or stop it") from err
+        _put_back(out)
         try:
             yield folder
         except BaseException:
             # Hours of work are kept for the next build, a refusal leaves nothing.
-            if not any(folder.rglob("*.record")):
+            if any(path.suffix in _WORTH_KEEPING for path in folder.rglob("*")):
+                logger.warning("%s: keeps what is done for the next build of this pack", folder)
+            else:
                 shutil.rmtree(folder, ignore_errors=True)
             raise
         shutil.rmtree(folder, ignore_errors=True)
     finally:
         os.close(handle)
+
+
+def _locked(folder: Path, out: Path) -> int:
+    """Make the folder and lock it; its descriptor, which holds the lock."""
+    while True:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            handle = os.open(folder, os.O_RDONLY)
+        except OSError as err:
+            raise MapError(f"{folder}: cannot be made ({err.strerror}); check the path and its permissions") from err
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            mine = os.fstat(handle)
+            # The build that had the lock may have removed the folder since it was opened here.
+            if folder.exists() and os.path.samestat(mine, folder.stat()):
+                return handle
+        except OSError as err:
+            os.close(handle)
+            if err.errno not in (errno.EWOULDBLOCK, errno.EACCES):
+                raise MapError(f"{folder}: cannot be locked ({err.strerror}); choose another file system") from err
+            raise MapError(f"{out}: another build is writing this pack; wait for it or stop it") from err
+        os.close(handle)
+
+
+def _put_back(out: Path) -> None:
+    """Mend an exchange in two steps that was cut off. Only under the lock: it may be another build's at this moment."""
+    aside = _aside(out)
+    try:
+        if aside.exists() and out.exists():
+            shutil.rmtree(aside)
+        elif aside.exists():
+            logger.warning("%s: put back; a build was cut off while it replaced it", out)
+            aside.rename(out)
+    except OSError as err:
+        raise MapError(f"{aside}: the pack that was at {out} cannot be put back ({err}); rename it by hand") from err
 
 
 def install(staged: Path, out: Path) -> None:

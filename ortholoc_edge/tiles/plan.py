@@ -209,7 +209,7 @@ def _layer(
     area: MapArea | None,
 ) -> LayerPlan:
     # Newest first (2023-06 before 2023, which may mean any month of it; no date last), then finest, then by name.
-    order = sorted(range(len(sources)), key=lambda k: (sources[k].grid.gsd_m, sources[k].name))
+    order = sorted(range(len(sources)), key=lambda k: (sources[k].gsd_m, sources[k].name))
     order.sort(key=lambda k: sources[k].date or "", reverse=True)
     sources, bounds = [sources[k] for k in order], [bounds[k] for k in order]
     pixel_m, phase = _pixels(sources, bounds, crs)

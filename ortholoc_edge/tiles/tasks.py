@@ -10,7 +10,6 @@ import functools
 import hashlib
 import logging
 import os
-import pickle
 import signal
 import sys
 import traceback
@@ -48,6 +47,8 @@ logger = logging.getLogger(__name__)
 _RECIPE = 1
 _WORKER_CACHE_BYTES = 64 * 2**20
 _PR_SET_PDEATHSIG = 1
+# Of SHA-256, before each record: a disk that lost power may hand back anything.
+_DIGEST_BYTES = 32
 
 
 class Record(msgspec.Struct, frozen=True, kw_only=True):
@@ -139,17 +140,28 @@ def job_name(job: Job) -> str:
     if isinstance(job, DopJob | DsmJob):
         rest = tuple(getattr(job, name) for name in job.__slots__ if name not in ("sources", "area"))
         digest.update(repr(rest).encode())
-        digest.update(pickle.dumps(job.area, protocol=4))
+        digest.update(_area_key(job.area))
     elif isinstance(job, FeatureJob):
         digest.update(repr((job.dop_sha256, job.matcher, job.model_sha256, job.per_mpx)).encode())
     return digest.hexdigest()[:32]
+
+
+def _area_key(area: MapArea | None) -> bytes:
+    """The numbers of an area alone: its pickle may differ after the way to another process."""
+    if area is None:
+        return b"everywhere"
+    shapes = [[ring.tolist() for ring in polygon] for polygon in area.polygons]
+    return repr((shapes, [(strip.line.tolist(), strip.half_width_m) for strip in area.strips])).encode()
 
 
 def finished(job: DopJob | DsmJob | FeatureJob, folder: Path) -> Record | None:
     """The record of an earlier run, if its file is there and has the bytes that it should."""
     name = job_name(job)
     try:
-        record = msgspec.msgpack.decode((folder / f"{name}.record").read_bytes(), type=Record)
+        stored = (folder / f"{name}.record").read_bytes()
+        if stored[:_DIGEST_BYTES] != hashlib.sha256(stored[_DIGEST_BYTES:]).digest():
+            return None
+        record = msgspec.msgpack.decode(stored[_DIGEST_BYTES:], type=Record)
         if record.bytes and _sha256((folder / name).read_bytes()) != record.sha256:
             return None
     except (OSError, msgspec.MsgspecError):
@@ -174,7 +186,8 @@ def run_job(job: Job, folder: Path) -> Record | Source:
     if data:
         write_file(folder / name, data)
         record = msgspec.structs.replace(record, bytes=len(data), sha256=_sha256(data))
-    write_file(folder / f"{name}.record", msgspec.msgpack.encode(record))
+    encoded = msgspec.msgpack.encode(record)
+    write_file(folder / f"{name}.record", hashlib.sha256(encoded).digest() + encoded)
     return record
 
 
