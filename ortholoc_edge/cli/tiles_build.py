@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import os
 import re
@@ -168,6 +169,8 @@ def run(args: argparse.Namespace) -> int:
     """Build, or say what would be built. Returns: the exit status. Raises: OrtholocError."""
     if args.jobs < 1:
         raise ConfigError(f"--jobs {args.jobs}: must be 1 or more")
+    if args.corridor is not None and args.area is None:
+        raise ConfigError(f"--corridor {args.corridor:g}: goes along a route; name one with --area FILE")
     options = PackOptions(
         dop_compression=args.dop_compression,
         quality=args.quality,
@@ -205,9 +208,10 @@ def run(args: argparse.Namespace) -> int:
             bar.update(max(100 * fraction - bar.n, 0))
             bar.refresh()
 
-        pack = build_pack(args.dop, args.dsm, args.out, options, progress, Workers(args.jobs, args.dask))
-    if args.sign is not None:
-        sign(pack.path, args.sign)
+        workers = Workers(args.jobs, args.dask)
+        # Before the pack takes its name: one that must be signed is never there without.
+        finish = None if args.sign is None else functools.partial(sign, private_key=args.sign)
+        pack = build_pack(args.dop, args.dsm, args.out, options, progress, workers, finish)
     print_facts(pack, as_json=args.json)
     if pack.manifest.vertical.amsl_minus_map_m is None:
         print(

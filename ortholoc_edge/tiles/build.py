@@ -183,6 +183,7 @@ def build_pack(
     options: PackOptions | None = None,
     progress: Progress | None = None,
     workers: Workers | None = None,
+    finish: Callable[[Path], None] | None = None,
 ) -> Pack:
     """Build an area pack from orthophotos and surface models.
 
@@ -193,6 +194,7 @@ def build_pack(
         dop, dsm: files and folders; see `sources.discover`.
         out: folder of the pack.
         progress: called with a fraction 0-1 and what is being done.
+        finish: called with the complete folder before it takes its name: what else belongs to it, as a signature.
     Raises: MapError for unusable sources and failed writes; ConfigError for options that contradict each other.
     """
     options, workers = options or PackOptions(), workers or Workers()
@@ -222,6 +224,8 @@ def build_pack(
                 lower = int(settings.quality * (limit / size) ** 1.5)
                 settings = replace(settings, quality=max(min(lower, settings.quality - 3), 10))
                 logger.info("%s: %.1f MB is too much; again at quality %d", out, size / 1e6, settings.quality)
+            if finish is not None:
+                finish(staged)
             install(staged, out)
     say(1.0, "done")
     return Pack.open(out)
