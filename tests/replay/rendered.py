@@ -142,7 +142,7 @@ def real_store(name: str) -> MapStore:
         pytest.skip(f"recorded flight {folder} is not here; set ORTHOLOC_EDGE_SHARED")
     with tempfile.TemporaryDirectory(prefix="ortholoc-test-") as scratch:
         # The store holds the files in memory.
-        return MapStore(build_pack(*sources, Path(scratch) / name, PackOptions()))
+        return MapStore(build_pack(*sources, Path(scratch) / name, PackOptions(vertical="unknown")))
 
 
 def write_flight(folder: Path, poses: Sequence[Rigid3], camera: Camera = CAMERA, seconds: int = 5) -> Path:
