@@ -6,6 +6,7 @@ recently used order; a cache of ours on top would hold the same pixels twice.
 
 from __future__ import annotations
 
+import ctypes
 import threading
 import warnings
 import zlib
@@ -30,12 +31,14 @@ from ortholoc_edge.geometry.grid import RasterGrid
 
 BLOCK_PX = 512
 
-# An open level holds one decoded block of its own besides GDAL's cache: 0.8 MB of DOP, 1 MB of DSM. A view lies in
-# at most 4 tiles of each of the two; two levels of them are at hand when a search changes its scale.
-MAX_HANDLES = 16
+# An open level that was read from holds buffers of its own besides GDAL's cache: 1.0 MB of a DOP, 1.7 MB of a DSM
+# (measured). A view lies in at most 4 tiles of either, mostly in one or two.
+MAX_HANDLES = 12
 
 # Of a pixel: what the sums of coordinates of millions of metres may be off.
 _PLACE_SLACK_PX = 1e-3
+
+_malloc_trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
 
 
 class UndecodableError(MapError):
@@ -79,8 +82,9 @@ class Handles:
         key = id(cog), level
         dataset = self._open.get(key)
         if dataset is None:
-            while len(self._open) >= self._limit:
+            if len(self._open) >= self._limit:
                 self._open.popitem(last=False)[1].close()
+                _give_back()
             dataset = self._open[key] = cog.open_level(level)
         self._open.move_to_end(key)
         return dataset
@@ -104,7 +108,7 @@ class Cog:
         """
         self.path = path
         self._data = data
-        self._handles = handles or Handles()
+        self._handles = Handles() if handles is None else handles
         self._grids: tuple[RasterGrid, ...] | None = None
         self._nodata: float | None = None
         self._memory: MemoryFile | None = MemoryFile(data)
@@ -329,6 +333,15 @@ def set_block_cache(limit_bytes: int) -> None:
     """Bound GDAL's block cache of the whole process."""
     with rasterio.Env():
         set_gdal_config("GDAL_CACHEMAX", limit_bytes)
+
+
+def _give_back() -> None:
+    """Let the C library return freed memory to the system, where it can (glibc).
+
+    GDAL allocates blocks of 0.3-1 MB, and glibc keeps what was freed of them: 40 MB over a flight (measured). 0.3 ms.
+    """
+    if _malloc_trim is not None:
+        _malloc_trim(0)
 
 
 def _same_place(found: RasterGrid, wanted: RasterGrid) -> bool:
