@@ -49,8 +49,7 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
 
 
 def _info(args: argparse.Namespace) -> int:
-    facts = pack_facts(Pack.open(args.pack))
-    print(json.dumps(facts, indent=2, ensure_ascii=False) if args.json else pack_table(facts))
+    print_facts(Pack.open(args.pack), as_json=args.json)
     return 0
 
 
@@ -65,6 +64,12 @@ def _verify(args: argparse.Namespace) -> int:
     signed = f", signed with the key of {args.public_key}" if pack.signed else ""
     print(f"{args.pack}: sound, {len(pack.manifest.notes())} files, {pack.total_bytes} bytes{signed}")
     return 0
+
+
+def print_facts(pack: Pack, *, as_json: bool) -> None:
+    """What a pack holds, to stdout."""
+    facts = pack_facts(pack)
+    print(json.dumps(facts, indent=2, ensure_ascii=False) if as_json else pack_table(facts))
 
 
 def pack_facts(pack: Pack) -> dict[str, Any]:
