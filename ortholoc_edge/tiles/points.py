@@ -40,6 +40,8 @@ _MAX_COLUMNS = 2**18
 _MAX_CELLS_PER_POINT = 64
 # Text rounds coordinates: to half a centimetre of a 20 cm step.
 _MAX_JITTER = 0.05
+# Coordinates this close were one before a program computed with them.
+_SAME_M = 1e-4
 _MIN_GRID_SHARE = 0.3
 
 # Sides of the cells of a scanned cloud, m, and how many first returns one should hold on average, so that few stay
@@ -146,7 +148,9 @@ def _axis(values: FloatArray) -> tuple[float, float, int]:
     Raises: ValueError if they are on none.
     """
     gaps = np.diff(values)
-    gaps = gaps[gaps > 1e-3 * np.median(gaps)]
+    gaps = gaps[gaps > _SAME_M]
+    if len(gaps) == 0:
+        raise ValueError(f"coordinates from {values[0]:g} to {values[-1]:g} are one")
     step = float(np.median(gaps[gaps < 1.5 * gaps.min()]))
     first = float(values[0])
     # A step that was rounded miscounts far away: so it is made more exact over longer and longer stretches.

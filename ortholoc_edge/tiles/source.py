@@ -199,7 +199,8 @@ def read_colours(source: Source, dataset: Any, window: Window) -> Colours:
                 table[index] = colour
         painted = table[stored[0]]
         return Colours(np.moveaxis(painted[..., :3], -1, 0), valid & (painted[..., 3] > 127))
-    bands = stored[[distinct.index(k) for k in wanted]]
+    # Reflectance below nothing is noise.
+    bands = np.maximum(stored[[distinct.index(k) for k in wanted]], 0)
     assert bands.shape[1:] == valid.shape == (rows, columns)
     return Colours(bands, valid)
 

@@ -260,8 +260,8 @@ def _probe(
             raise _NotUsableError(what) if picture else MapError(what)
         grid = raster_grid(dataset, Path(found.where))
         own = None if dataset.crs is None else pyproj.CRS.from_user_input(dataset.crs.to_wkt())
-        by_world_file = any(name.lower().endswith(_WORLD_FILES) for name in dataset.files)
-        crs = _chosen_crs(found, own or _projection_beside(found), by_world_file, assign_crs, assigned, notes)
+        bare = dataset.driver == "AAIGrid" or any(name.lower().endswith(_WORLD_FILES) for name in dataset.files)
+        crs = _chosen_crs(found, own or _projection_beside(found), bare, assign_crs, assigned, notes)
         common: dict[str, Any] = {
             "path": found.gdal_path,
             "name": found.name,
@@ -358,11 +358,9 @@ def _projection_beside(found: _Found) -> Any:
         return pyproj.CRS.from_user_input(text) if text else None
 
 
-def _chosen_crs(
-    found: _Found, own: Any, by_world_file: bool, assign_crs: str | None, assigned: Any, notes: _Notes
-) -> Any:
+def _chosen_crs(found: _Found, own: Any, bare: bool, assign_crs: str | None, assigned: Any, notes: _Notes) -> Any:
     if own is None:
-        if assign_crs is None and by_world_file:
+        if assign_crs is None and bare:
             raise MapError(
                 f"{found.where}: placed by a world file or by coordinates in text, which name no reference system;"
                 " say which it is with --crs EPSG:n (or --crs local for local metres)"
