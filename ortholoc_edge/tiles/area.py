@@ -216,28 +216,41 @@ class MapArea:
         return any(_strip_meets(strip, bounds) for strip in self.strips)
 
 
-def map_from_lonlat(lonlat: npt.ArrayLike, crs: str, what: str, source_crs: str = LONLAT) -> FloatArray:
+def map_from_lonlat(
+    lonlat: npt.ArrayLike,
+    crs: str,
+    what: str,
+    source_crs: str = LONLAT,
+    near: tuple[float, float] | None = None,
+) -> FloatArray:
     """Points (N, 2), longitude and latitude in degrees (or ``source_crs``, x first), to the map (N, 2), m.
 
     The way PROJ holds best at that place, without the network, as `Georeference` takes it.
+    Args:
+        near: (longitude, latitude) of that place; None: the middle of the points.
     Raises: MapError naming ``what`` for points without an image, or a system that cannot carry a map.
     """
     points = np.asarray(lonlat, dtype=np.float64).reshape(-1, 2)
     target = projected_crs(crs, what)
     if source_crs != LONLAT and target == pyproj.CRS.from_user_input(source_crs):
         return points.copy()
+    place = (points.min(axis=0) + points.max(axis=0)) / 2 if near is None else np.array(near)
+    interest = _interest(*place) if source_crs == LONLAT or near is not None else None
     set_network_enabled(active=False)
     try:
         transformer = pyproj.Transformer.from_crs(
             source_crs,
             target,
             always_xy=True,
-            area_of_interest=_interest(points) if source_crs == LONLAT else None,
+            area_of_interest=interest,
             allow_ballpark=False,
         )
         x, y = transformer.transform(points[:, 0], points[:, 1], errcheck=True)
     except ProjError as err:
-        raise MapError(f"{what}: cannot be shown in {target.name} ({err}); check it and the map's system") from err
+        raise MapError(
+            f"{what}: around ({place[0]:.2f}, {place[1]:.2f}), cannot be shown in {target.name} ({err}); check it and"
+            " the map's system"
+        ) from err
     result = np.stack([x, y], axis=-1)
     if not np.isfinite(result).all():
         raise MapError(f"{what}: outside the domain of {target.name}; check it and the map's system")
@@ -319,9 +332,7 @@ def _scale_at(xy_map: FloatArray, crs: str) -> float:
     return math.dist(*ends) / (2.0 * _PROBE_M)
 
 
-def _interest(lonlat: FloatArray) -> Any:
-    low, high = lonlat.min(axis=0), lonlat.max(axis=0)
-    lon, lat = (low + high) / 2
+def _interest(lon: float, lat: float) -> Any:
     lon = (lon + 180.0) % 360.0 - 180.0
     margin = _INTEREST_MARGIN_DEG
     return AreaOfInterest(
