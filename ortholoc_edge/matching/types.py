@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -79,4 +79,13 @@ class Matcher(Protocol):
 
     def match(self, query: Features, reference: Features) -> Matches:
         """Mutual matches between two sets of features."""
+        ...
+
+
+@runtime_checkable
+class UnscaledMatcher(Matcher, Protocol):
+    """A matcher that also takes pictures at their own scale, whatever their size."""
+
+    def extract_unscaled(self, image: ImageArray, valid: BoolArray | None = None) -> Features:
+        """As `extract`, with nothing resized."""
         ...

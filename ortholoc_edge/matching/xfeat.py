@@ -13,7 +13,7 @@ from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, I
 from ortholoc_edge.matching.models import check_hash
 from ortholoc_edge.matching.nearest import mutual_nearest
 from ortholoc_edge.matching.types import Features, Matches
-from ortholoc_edge.matching.working_image import working_image
+from ortholoc_edge.matching.working_image import WorkingImage, working_image
 
 _INPUT: Final = "normalised"
 _OUTPUTS: Final = ["features", "heat", "reliability"]
@@ -127,7 +127,22 @@ class XFeatMatcher:
         Raises: ModelError if the inference fails; ValueError if image or mask have another type or shape.
         """
         width, height = _working_size(image.shape, self.working_px)
-        work = working_image(image, valid, width, height)
+        return self._extracted(working_image(image, valid, width, height))
+
+    def extract_unscaled(self, image: ImageArray, valid: BoolArray | None = None) -> Features:
+        """As `extract`, at the image's own size: one pixel of it is one of the network's.
+
+        For pictures that are already at the scale of what they are matched with.
+        """
+        rows, columns = image.shape
+        below, right = -rows % _MULTIPLE, -columns % _MULTIPLE
+        if below or right:
+            known = np.ones(image.shape, np.bool_) if valid is None else valid
+            valid = np.pad(known, ((0, below), (0, right)))
+            image = np.pad(image, ((0, below), (0, right)))
+        return self._extracted(working_image(image, valid, columns + right, rows + below))
+
+    def _extracted(self, work: WorkingImage | None) -> Features:
         if work is None:
             return _no_features()
         features, heat, reliability = self._network.run(work.image, work.usable)
