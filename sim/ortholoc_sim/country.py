@@ -31,7 +31,8 @@ _ONE = 1 << _SHIFT
 # Rasters are drawn in blocks that fit the caches; a block's border sees what reaches in from this far.
 _BLOCK_PX = 1280
 _REACH_M = 45.0
-_CROWN_M = 5.0
+_CROWN_M = 7.0
+_FOREST_SPREAD, _FOREST_FLOOR = 1.6, 0.7
 _NET_M = 260.0
 _EDGE_POINTS = 9
 _LAKE_CELL_M = 1500.0
@@ -913,14 +914,16 @@ class _Painter:
                 continue
             px, radius, height = view.px(trees.xy[at]), trees.radius_m[at], trees.height_m[at]
             base = np.round(px).astype(int)
-            reach = int(np.ceil(radius.max() * scale)) + 1
+            # Between the crowns of a forest one looks on branches, not on its ground.
+            spread = _FOREST_SPREAD if plot.use == _FOREST else 1.0
+            reach = int(np.ceil(spread * radius.max() * scale)) + 1
             for dv in range(-reach, reach + 1):
                 for du in range(-reach, reach + 1):
                     near = np.hypot(*(base + np.array([du, dv]) - px).T) / scale / radius
                     u, v = base[:, 0] + du, base[:, 1] + dv
-                    hit = (near < 1) & (u >= 0) & (v >= 0) & (u < view.width) & (v < view.height)
+                    hit = (near < spread) & (u >= 0) & (v >= 0) & (u < view.width) & (v < view.height)
                     if hit.any():
-                        dome = height[hit] - (radius[hit] * 0.9) * near[hit] ** 2
+                        dome = np.where(near < 1, height - 0.9 * radius * near**2, _FOREST_FLOOR * height)[hit]
                         np.maximum.at(above, (v[hit], u[hit]), dome.astype(np.float32))
 
     def _roof_heights(self, out: Float32Array, house: _House) -> None:

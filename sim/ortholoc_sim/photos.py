@@ -35,7 +35,7 @@ from ortholoc_sim.epoch import FLIGHT as LIGHT
 from ortholoc_sim.world import Scene, WorldSpec
 
 CAMERA = Camera.from_focal(640, 480, 540.0)
-_TEXEL_M = 0.15
+_TEXEL_M = 0.2
 _MARGIN_M = 30.0
 _SPEED_M_S = 15.0
 _MAX_TILT_DEG = 15.0
