@@ -207,7 +207,10 @@ def read_colours(source: Source, dataset: Any, window: Window) -> Colours:
 
 def read_heights(source: Source, dataset: Any, window: Window) -> Heights:
     """A window inside a surface model."""
-    raw = dataset.read(source.bands[0], window=window).astype(np.float64)
+    stored = dataset.read(source.bands[0], window=window)
+    # Signalling NaN, which damaged files have, warns when it is widened.
+    with np.errstate(invalid="ignore"):
+        raw = stored.astype(np.float64)
     valid = (dataset.dataset_mask(window=window) > 0) & np.isfinite(raw)
     undeclared: list[float] = []
     low_or_huge = valid & ((raw < MIN_HEIGHT_M) | (raw > _SENTINEL_MAGNITUDE))

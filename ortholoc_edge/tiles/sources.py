@@ -58,6 +58,9 @@ _MAX_BLOCK_PX = 2**28
 # County mosaics have 10^10 pixels; a VRT may have more.
 _MAX_PX = 2**36
 
+_MAX_COORDINATE = 1e9
+_PIXEL_RANGE = (1e-9, 1e6)
+
 _METRES = ("", "m", "metre", "meter", "metres", "meters", "1")
 
 # swissIMAGE ends names with the code of its system, EPSG:2056, which is no year yet.
@@ -259,6 +262,8 @@ def _probe(
             what = f"{found.where}: no georeference; add its world file, or assign one with gdal_translate -a_ullr"
             raise _NotUsableError(what) if picture else MapError(what)
         grid = raster_grid(dataset, Path(found.where))
+        if not _on_earth(grid):
+            raise MapError(f"{found.where}: georeference {tuple(dataset.transform)[:6]} cannot be true; fetch it again")
         own = None if dataset.crs is None else pyproj.CRS.from_user_input(dataset.crs.to_wkt())
         bare = dataset.driver == "AAIGrid" or any(name.lower().endswith(_WORLD_FILES) for name in dataset.files)
         crs = _chosen_crs(found, own or _projection_beside(found), bare, assign_crs, assigned, notes)
@@ -330,6 +335,12 @@ def _check_size(dataset: Any, found: _Found) -> None:
             f"{found.where}: stored in blocks of {columns} x {rows} pixels, too large for memory;"
             " convert it with: gdal_translate -co TILED=YES"
         )
+
+
+def _on_earth(grid: RasterGrid) -> bool:
+    """Coordinates and pixels of any system, in degrees, feet or metres, are within these."""
+    sides = sorted((grid.dx, abs(grid.dy)))
+    return max(np.abs(grid.bounds)) < _MAX_COORDINATE and _PIXEL_RANGE[0] < sides[0] and sides[1] < _PIXEL_RANGE[1]
 
 
 def _is_slow(dataset: Any, found: _Found) -> bool:
