@@ -226,6 +226,11 @@ class Forecast:
         }
 
 
+LABELS: Final = {
+    Verdict.EXPECTED: "fixes expected",
+    Verdict.DOUBTFUL: "fixes doubtful",
+    Verdict.NONE: "no fixes expected",
+}
 # RGB; told apart with red-green blindness as well.
 COLOURS: Final = {Verdict.EXPECTED: (60, 160, 255), Verdict.DOUBTFUL: (255, 215, 60), Verdict.NONE: (255, 60, 50)}
 
@@ -547,7 +552,7 @@ def text(result: Forecast, speed_mps: float | None) -> str:
     ]
     for verdict in Verdict:
         length = facts[f"{verdict}_m"]
-        rows.append((f"fixes {verdict}", f"{_length(length)} ({100 * length / total:.0f} %)"))
+        rows.append((LABELS[verdict], f"{_length(length)} ({100 * length / total:.0f} %)"))
     rows += [(f"  {cause}", _length(length)) for cause, length in facts["reasons_m"].items()]
     rows.append(("longest gap", way(facts["longest_gap_m"], facts["longest_gap_s"])))
     rows.append(("  with doubtful", way(facts["longest_without_expected_m"], facts["longest_without_expected_s"])))

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ortholoc_edge.geometry.arrays import BoolArray, ImageArray
 from ortholoc_edge.geometry.grid import RasterGrid
-from ortholoc_edge.tiles.forecast import COLOURS, Forecast, Verdict
+from ortholoc_edge.tiles.forecast import COLOURS, LABELS, Forecast, Verdict
 from ortholoc_edge.tiles.store import MapStore
 
 _INK, _PAPER, _NO_MAP = (255, 255, 255), (20, 20, 20), (70, 70, 74)
@@ -104,7 +104,7 @@ def _at(px: npt.NDArray[np.int32]) -> tuple[int, int]:
 
 
 def _legend(canvas: ImageArray, forecast: Forecast) -> None:
-    rows = [(COLOURS[v], f"fixes {v}  {forecast.length_m(v) / 1e3:.2f} km") for v in Verdict]
+    rows = [(COLOURS[v], f"{LABELS[v]}  {forecast.length_m(v) / 1e3:.2f} km") for v in Verdict]
     rows.append((_INK, "start"))
     width = max(cv2.getTextSize(text, _FONT, 0.55, 1)[0][0] for _, text in rows)
     cv2.rectangle(canvas, (10, 10), (66 + width, 20 + 26 * len(rows)), _PAPER, -1)
