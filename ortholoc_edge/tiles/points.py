@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gzip
 import io
+import struct
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -48,6 +49,8 @@ _MIN_GRID_SHARE = 0.3
 # empty.
 _CELLS_M = (0.5, 1.0, 2.0, 5.0)
 _POINTS_PER_CELL = 2.0
+# LASzip needs about two bytes a point; points that repeat exactly need far less.
+_MAX_POINTS_PER_BYTE = 100
 _NOISE_CLASSES = (7, 18)
 _MAX_OUTSIDE_SHARE = 0.01
 
@@ -336,9 +339,48 @@ def _cloud(file: Path, member: str | None) -> Iterator[Any]:
         cloud = packed if member is None else io.BytesIO(packed.read(_MAX_MEMBER_BYTES + 1))
         if member is not None and cloud.seek(0, io.SEEK_END) > _MAX_MEMBER_BYTES:
             raise MapError(f"{file}: {member} is larger than 4 GiB; unpack it first")
-        cloud.seek(0)
+        _check_sizes(cloud)
         try:
             with laspy.open(cloud, closefd=False) as reader:
                 yield reader
         except laspy.errors.LaspyException as err:
             raise ValueError(str(err)) from err
+
+
+def _check_sizes(cloud: IO[bytes]) -> None:
+    """Refuse counts in the header that the file has no room for; laspy and lazrs would believe them.
+
+    Fields as in the ASPRS LAS specification 1.4 and LASzip's: all little-endian.
+    """
+    size = cloud.seek(0, io.SEEK_END)
+    cloud.seek(0)
+    head = cloud.read(375)
+    if len(head) < 227 or head[:4] != b"LASF":
+        raise ValueError("no LAS header")
+    header_size, points_at, records = struct.unpack_from("<HII", head, 94)
+    point_format, point_bytes, count = struct.unpack_from("<BHI", head, 104)
+    if head[25] >= 4:
+        if len(head) < 375:
+            raise ValueError("LAS header cut off")
+        extra_at, extra, count = struct.unpack_from("<QIQ", head, 235)
+        if extra and extra_at + 60 * extra > size:
+            raise ValueError(f"{extra} extended records beyond its end")
+    if not header_size + 54 * records <= points_at <= size or point_bytes < 20:
+        raise ValueError(f"header with {records} records, points of {point_bytes} bytes at byte {points_at} of {size}")
+    room = size - points_at
+    if not point_format & 0x80:
+        if count * point_bytes > room:
+            raise ValueError(f"{count} points, room for {room // point_bytes}")
+    elif count > _MAX_POINTS_PER_BYTE * room:
+        raise ValueError(f"{count} points in {room} bytes")
+    else:
+        cloud.seek(points_at)
+        table_at = int.from_bytes(cloud.read(8), "little", signed=True)
+        if table_at == -1:  # written to a stream: then it is noted at the end
+            cloud.seek(size - 8)
+            table_at = int.from_bytes(cloud.read(8), "little", signed=True)
+        cloud.seek(max(0, min(table_at, size)))
+        chunks = int.from_bytes(cloud.read(8)[4:], "little")
+        if not points_at < table_at <= size - 8 or chunks > min(count, room):
+            raise ValueError(f"table of {chunks} chunks at byte {table_at} of {size}")
+    cloud.seek(0)
