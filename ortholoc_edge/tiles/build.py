@@ -426,7 +426,8 @@ class _Build:
         manifest = self._with_reports(manifest, records[:count], records[count:])
         write_manifest(manifest, self._staged / MANIFEST_NAME)
         self._say(0.98, "checking the pack")
-        Pack.open(self._staged)
+        if missing := Pack.open(self._staged).missing:
+            raise MapError(f"{self._staged}: {min(missing)} was not written as it should; check the disk")
         return self._staged
 
     # -- work ------------------------------------------------------------------------------------------

@@ -24,6 +24,8 @@ logger = logging.getLogger(__name__)
 _MIN_GSD_M, _MAX_GSD_M = 0.002, 100.0
 # Of a pixel per tile: pixel sizes that differ by less are one size written with other digits.
 _SIZE_DIGITS = 6
+# Of the box around the orthophotos: a DSM that covers less is worth a warning.
+_SPARSE_COVERAGE = 0.95
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +114,11 @@ def make_plan(
                 " they do not meet, choose another area or other sources"
             )
         shared = inside
+    asked = _union(dop_bounds) if map_area is None else _meeting(_union(dop_bounds), map_area.bounds)
+    assert asked is not None, "it holds what is shared"
+    share = _area_m2(shared) / _area_m2(asked)
+    if share < _SPARSE_COVERAGE:
+        logger.warning("the DSM covers only %.0f %% of the orthophoto; the pack ends there", 100 * share)
     layers = []
     for sources, bounds, others, gsd in (
         (dop, dop_bounds, dsm_bounds, dop_gsd_m),

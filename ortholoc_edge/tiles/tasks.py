@@ -51,6 +51,10 @@ _PR_SET_PDEATHSIG = 1
 _DIGEST_BYTES = 32
 
 
+# Inside of Record "bytes" is a field.
+_Data = bytes
+
+
 class Record(msgspec.Struct, frozen=True, kw_only=True):
     """What a piece of work wrote; a file's name is that of the record.
 
@@ -71,8 +75,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     valid_fraction: float = 0.0
     segment_crc32: str = ""
     shown: tuple[int, ...] = ()
-    share: bytes = b""
-    matchability: bytes = b""
+    share: _Data = b""
+    matchability: _Data = b""
     min_m: float = 0.0
     max_m: float = 0.0
     filled_cells: int = 0
