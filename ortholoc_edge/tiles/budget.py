@@ -15,6 +15,7 @@ from ortholoc_edge.errors import ConfigError
 from ortholoc_edge.geometry.arrays import BoolArray
 from ortholoc_edge.geometry.grid import RasterGrid
 from ortholoc_edge.tiles import encode
+from ortholoc_edge.tiles.features import bytes_per_mpx
 from ortholoc_edge.tiles.lattice import CROP_PX, PixelBox
 from ortholoc_edge.tiles.mosaic import dop_mosaic, dsm_mosaic
 from ortholoc_edge.tiles.plan import LayerPlan, Plan
@@ -30,7 +31,6 @@ _SAMPLE_PX = 512
 _SIGMAS = 2.0
 # STAC, mosaics, reports and the manifest's entry.
 _BYTES_PER_TILE = 12_000
-_BYTES_PER_FEATURE = 41.0
 
 _QUALITIES = (85, 75, 65, 55, 45)
 _Z_ERRORS_M = (0.02, 0.05, 0.1)
@@ -90,10 +90,9 @@ class Sampler:
         dop_mean, dop_sigma = self._layer(self._plan.dop, settings.dop_gsd_m, self._dop, settings)
         dsm_mean, dsm_sigma = self._layer(self._plan.dsm, settings.dsm_gsd_m, self._dsm, settings)
         shrink = (self._plan.dop.lattice.pixel_m / settings.dop_gsd_m) ** 2
-        levels = sum(0.25**k for k in range(encode.LEVELS))
         valid = float(np.mean([valid.mean() for _, valid in self._dop]))
-        mpx = self._plan.dop.pixels * valid * shrink * levels / 1e6
-        features = settings.features_per_mpx * mpx * _BYTES_PER_FEATURE
+        mpx = self._plan.dop.pixels * valid * shrink / 1e6
+        features = mpx * bytes_per_mpx(settings.features_per_mpx)
         tiles = len(self._plan.dop.tiles) * max(shrink, 0.25) + len(self._plan.dsm.tiles)
         return Estimate(
             dop_mean, dsm_mean, features, tiles * _BYTES_PER_TILE, float(np.hypot(dop_sigma, dsm_sigma))
