@@ -188,7 +188,7 @@ def grid_text(source: Source, layout: Layout, progress: Callable[[float], None])
     grid = source.grid
     heights = np.full(grid.width * grid.height, -np.inf, np.float32)
     done, total = 0, grid.width * grid.height
-    with named_errors(source.where):
+    with named_errors(source.where), np.errstate(over="ignore"):
         for points in _text_chunks(source.file, source.member, layout):
             px = np.rint(grid.px_from_map(points[:, :2])).astype(np.intp)
             usable = np.isfinite(points[:, 2])
@@ -294,7 +294,9 @@ def grid_cloud(source: Source, progress: Callable[[float], None]) -> Float32Arra
     grid = source.grid
     heights = np.full(grid.width * grid.height, -np.inf, np.float32)
     outside = done = 0
-    with named_errors(source.where), _cloud(source.file, source.member) as reader:
+    # What is too high for float32 becomes infinite, and that is no height.
+    overflow = np.errstate(over="ignore")
+    with named_errors(source.where), overflow, _cloud(source.file, source.member) as reader:
         total = reader.header.point_count
         for points in reader.chunk_iterator(_CHUNK_POINTS):
             kept = ~np.isin(np.asarray(points.classification), _NOISE_CLASSES)

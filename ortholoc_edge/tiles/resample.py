@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -10,7 +11,9 @@ import numpy as np
 import numpy.typing as npt
 import pyproj
 from affine import Affine
+from pyproj.aoi import AreaOfInterest
 from pyproj.exceptions import CRSError, ProjError
+from pyproj.transformer import TransformerGroup
 from rasterio.crs import CRS
 from rasterio.enums import Resampling
 from rasterio.warp import reproject
@@ -37,6 +40,9 @@ _STEP_PX = 1024
 _MAX_STEP_SOURCE_PX = 4 * 2**20
 _MARGIN_PX = 3
 _ANY_CRS = "EPSG:32632"
+# Between systems tied to the continents and those tied to the Earth the plates' motion counts, too: about 1 m.
+_GOOD_WAY_M = 1.0
+_AREA_DEG = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,6 +168,31 @@ def read_dsm(source: Source, grid: RasterGrid, crs: str | None) -> Float32Array:
             usable = (share >= _MIN_VALID_SHARE) & (nearest > 0)
             heights[part] = np.where(usable, mixed + base, np.nan)
     return heights
+
+
+def transform_caveat(source: Source, crs: str | None) -> str | None:
+    """What is wrong with the way from a source's system to the pack's, one sentence; None if nothing.
+
+    PROJ takes a rougher way where the best one needs a grid that is not installed, and does not say so.
+    """
+    if source.crs is None or crs is None or same_crs(source.crs, crs):
+        return None
+    west, south, east, north = source.grid.bounds
+    with named_errors(source.where, "has no place in the pack's system"):
+        to_degrees = pyproj.Transformer.from_crs(_crs(source.crs), _crs(source.crs).geodetic_crs, always_xy=True)
+        lon, lat = to_degrees.transform((west + east) / 2, (south + north) / 2, errcheck=True)
+        area: Any = AreaOfInterest(lon - _AREA_DEG, lat - _AREA_DEG, lon + _AREA_DEG, lat + _AREA_DEG)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Best transformation is not available")
+            ways = TransformerGroup(_crs(source.crs), _crs(crs), always_xy=True, area_of_interest=area).transformers
+    accuracy = ways[0].accuracy if ways else -1.0
+    if 0 <= accuracy <= _GOOD_WAY_M:
+        return None
+    error = "an error that PROJ does not know" if accuracy < 0 else f"an error of about {accuracy:g} m"
+    return (
+        f"{source.name}: the way from {_crs(source.crs).name} to {_crs(crs).name} has {error};"
+        " install PROJ's grids for it, or fetch the data in the pack's system"
+    )
 
 
 @lru_cache(maxsize=64)

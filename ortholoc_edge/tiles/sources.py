@@ -22,7 +22,7 @@ from ortholoc_edge.tiles import points
 from ortholoc_edge.tiles.cog import raster_grid
 from ortholoc_edge.tiles.georeference import vertical_of
 from ortholoc_edge.tiles.prepare import prepare
-from ortholoc_edge.tiles.resample import DopPixels, is_copied, read_dop, read_dsm
+from ortholoc_edge.tiles.resample import DopPixels, is_copied, read_dop, read_dsm, transform_caveat
 from ortholoc_edge.tiles.source import Kind, Source, Stretch, fingerprint, named_errors, opened, with_common_stretch
 
 __all__ = [
@@ -35,6 +35,7 @@ __all__ = [
     "prepare",
     "read_dop",
     "read_dsm",
+    "transform_caveat",
     "with_common_stretch",
 ]
 

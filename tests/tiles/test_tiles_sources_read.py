@@ -7,7 +7,15 @@ from test_tiles_sources import CRS, GRID, only, picture, raster, relief
 
 from ortholoc_edge.errors import MapError
 from ortholoc_edge.geometry.grid import RasterGrid
-from ortholoc_edge.tiles.sources import discover, is_copied, prepare, read_dop, read_dsm, with_common_stretch
+from ortholoc_edge.tiles.sources import (
+    discover,
+    is_copied,
+    prepare,
+    read_dop,
+    read_dsm,
+    transform_caveat,
+    with_common_stretch,
+)
 
 
 def centres(grid):
@@ -240,3 +248,14 @@ def test_deep_collar_is_left_out_but_zeros_inside_are_not(tmp_path, caplog):
     assert "black from the border inward" in caplog.text and source.dtype == "uint16" and source.nir == 4
     got = read_dop(with_common_stretch([source])[0], GRID, CRS)
     assert not got.valid[:, :5].any() and got.valid[:, 5:].all()
+
+
+def test_rough_ways_between_systems_are_told(tmp_path):
+    # No grid exists for the European datum of 1950, and none is in PROJ's wheel for the British one.
+    old = only(raster(tmp_path / "a.tif", picture(), crs="EPSG:23032"))
+    assert "has an error of about 2 m" in transform_caveat(old, CRS) and transform_caveat(old, "EPSG:23032") is None
+    grid = RasterGrid(60, 40, 450_000.0, 200_000.0, 0.5, -0.5)
+    british = only(raster(tmp_path / "c.tif", picture(grid=grid), grid=grid, crs="EPSG:27700"))
+    assert "error" in transform_caveat(british, "EPSG:25830")
+    new = only(raster(tmp_path / "b.tif", picture()))
+    assert transform_caveat(new, "EPSG:25833") is None and transform_caveat(new, None) is None
