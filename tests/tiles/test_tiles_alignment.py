@@ -171,12 +171,12 @@ def test_peaks_are_found_below_a_cell_and_not_at_the_border():
 
 
 def test_a_tile_that_lies_where_another_belongs_is_named(tmp_path):
-    # Two tiles of 256 m side by side whose files were swapped.
-    heights, grey = town(5, 512.0)
+    # Two tiles of 160 m side by side whose files were swapped.
+    heights, grey = town(5, 320.0)
     surface = shifted(heights, 0.0, 0.0)
-    lattice = Lattice(west=WEST, top=TOP, pixel_m=DSM_M, tile_px=512, levels=5)
-    west, east = surface[:512, :512], surface[:512, 512:]
-    boxes = PixelBox(0, 0, 512, 512), PixelBox(512, 0, 512, 512)
+    lattice = Lattice(west=WEST, top=TOP, pixel_m=DSM_M, tile_px=320, levels=5)
+    west, east = surface[:320, :320], surface[:320, 320:]
+    boxes = PixelBox(0, 0, 320, 320), PixelBox(320, 0, 320, 320)
     sources = [source("west.tif", None), source("east.tif", None)]
 
     def found(name, first, second):
@@ -187,9 +187,9 @@ def test_a_tile_that_lies_where_another_belongs_is_named(tmp_path):
     assert found("right", west, east) == []
     first, second = found("swapped", east, west)
     assert "west.tif" in first
-    assert "256 m east" in first
+    assert "160 m east" in first
     assert "east.tif" in second
-    assert "256 m west" in second
+    assert "160 m west" in second
 
 
 def test_holes_of_both_layers_are_no_edges(scene):

@@ -145,12 +145,12 @@ def test_sources_cover_the_tiles_that_show_them():
 
 
 def test_a_large_ragged_pack_stays_small_and_equal_input_gives_equal_bytes():
-    box = PixelBox(0, 0, 512 * 64, 512 * 64)
+    box = PixelBox(0, 0, 192 * 64, 192 * 64)
     lattice = Lattice(west=WEST, top=TOP, pixel_m=0.2, tile_px=2**16, levels=5)
     manifest, georeference = pack(crs=None)
     dop = Dop(lattice=lattice, compression="webp", sources=[], tiles=[tile(DopTile, 0, box)])
     large = Manifest(**{key: getattr(manifest, key) for key in manifest.__struct_fields__} | {"dop": dop})
-    ragged = np.where(np.random.default_rng(0).random((512, 512)) < 0.5, 100, 0).astype(np.uint8)
+    ragged = np.where(np.random.default_rng(0).random((192, 192)) < 0.5, 100, 0).astype(np.uint8)
     filled = [(WEST + k, TOP - k, k) for k in range(1000)]
     data = coverage_geojson(large, georeference, [ragged], [full(DSM_BOX)], filled)
     assert len(data) < 200_000
