@@ -27,6 +27,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         level=logging.DEBUG if args.verbose else logging.INFO,
         format="%(levelname)s %(name)s: %(message)s",
     )
+    # It repeats as a log line every error that it raises, also those of trying one file format after another.
+    logging.getLogger("rasterio").setLevel(logging.DEBUG if args.verbose else logging.ERROR)
     try:
         return int(args.run(args))
     except ConfigError as error:

@@ -260,8 +260,9 @@ def _feature_tile(job: FeatureJob) -> tuple[bytes, Record]:
     with Cog(path.read_bytes(), path) as cog:
         levels = []
         for level, grid in enumerate(cog.grids):
-            image, valid = cog.read_image(level, PixelWindow(0, 0, grid.width, grid.height))
-            levels.append((np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8), valid))
+            bands, valid = cog.read_image(level, PixelWindow(0, 0, grid.width, grid.height))
+            grey = cv2.cvtColor(np.ascontiguousarray(np.moveaxis(bands, 0, -1)), cv2.COLOR_RGB2GRAY)
+            levels.append((np.asarray(grey, dtype=np.uint8), valid))
     data, counts = features.extract_tile(levels, matcher, job.per_mpx)
     return data, Record(counts=tuple(counts))
 
