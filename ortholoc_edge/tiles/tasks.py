@@ -377,14 +377,14 @@ def _on_dask(jobs: Sequence[_J], folder: Path, address: str) -> Iterator[tuple[_
     except ImportError as err:
         raise ConfigError("--dask needs Dask; install it with: pip install 'ortholoc-edge[dask]'") from err
     try:
-        client = Client(address, timeout="10s", set_as_default=False)
+        client = Client(address, timeout="5s", set_as_default=False)
     except (OSError, ValueError) as err:
         raise ConfigError(f"--dask {address}: no scheduler answers ({err}); start one with: dask scheduler") from err
     with client:
         _check_shared(client, folder, address)
         futures = {client.submit(_guarded, job, folder, key=f"{job_name(job)}", pure=False): job for job in jobs}
         try:
-            for future in as_completed(list(futures)):
+            for future in as_completed(list(futures), loop=client.loop):
                 if future.status != "finished":
                     raise MapError(f"--dask {address}: a task failed ({future.exception()}); see the workers' logs")
                 yield futures.pop(future), _unpacked(future.result())
