@@ -1,7 +1,7 @@
 import shutil
 
 import pytest
-from tile_rasters import SHARED, real_sources, write_holed_scene, write_scene
+from tile_rasters import SHARED, real_sources, write_holed_scene, write_scene, write_wide_scene
 
 from ortholoc_edge.tiles.build import PackOptions, build_pack
 
@@ -13,8 +13,14 @@ def scene(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
+def wide_scene(tmp_path_factory):
+    """(DOP, DSM) of several tiles each."""
+    return write_wide_scene(tmp_path_factory.mktemp("wide"))
+
+
+@pytest.fixture(scope="session")
 def plane_pack(scene, tmp_path_factory):
-    return build_pack(*scene, tmp_path_factory.mktemp("plane") / "pack", PackOptions(quality=95))
+    return build_pack(*scene, tmp_path_factory.mktemp("plane") / "pack", PackOptions(quality=95, vertical="unknown"))
 
 
 @pytest.fixture(scope="session")
@@ -39,7 +45,7 @@ def real_pack(tmp_path_factory):
         if sources is None:
             pytest.skip(f"no real rasters of {name} under {SHARED}")
         if name not in built:
-            built[name] = build_pack(*sources, tmp_path_factory.mktemp(name) / "pack")
+            built[name] = build_pack(*sources, tmp_path_factory.mktemp(name) / "pack", PackOptions(vertical="unknown"))
         return built[name], sources
 
     return get

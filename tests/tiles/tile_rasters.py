@@ -11,7 +11,7 @@ from affine import Affine
 from ortholoc_edge.geometry.grid import RasterGrid
 
 CRS = "EPSG:32633"
-# Odd sizes: the overviews' pixels are then no multiple of the full ones.
+# Odd sizes: the pack's tiles reach beyond them.
 DOP_GRID = RasterGrid(1475, 1307, 400_000.0, 5_300_000.0, 0.1, -0.1)
 DSM_GRID = RasterGrid(739, 655, 400_000.0, 5_300_000.0, 0.2, -0.2)
 SHARED = Path(__file__).parents[2].parent / "shared" / "data" / "real"
@@ -94,3 +94,66 @@ def real_sources(name):
     else:
         paths = SHARED / name / f"{name}_dop.tif", SHARED / name / f"{name}_dsm.tif"
     return paths if all(path.is_file() for path in paths) else None
+
+
+def dop_of(pack, grid=DOP_GRID):
+    """RGB (H, W, 3) and validity of a pack's orthophoto on a grid of its pixels, by rasterio alone."""
+    pixels, valid = np.zeros((grid.height, grid.width, 3), np.uint8), np.zeros((grid.height, grid.width), bool)
+    for tile in pack.manifest.dop.tiles:
+        with rasterio.open(pack.path / tile.file) as dataset:
+            here, there = _common(pack.manifest.dop.lattice, tile.box, grid)
+            pixels[here] = np.moveaxis(dataset.read(), 0, -1)[there]
+            valid[here] = dataset.dataset_mask()[there] > 0
+    return pixels, valid
+
+
+def dsm_of(pack, grid=DSM_GRID):
+    """Heights (H, W) of a pack on a grid of its pixels, NaN where there are none, by rasterio alone."""
+    heights = np.full((grid.height, grid.width), np.nan, np.float32)
+    for tile in pack.manifest.dsm.tiles:
+        with rasterio.open(pack.path / tile.file) as dataset:
+            here, there = _common(pack.manifest.dsm.lattice, tile.box, grid)
+            heights[here] = np.where(dataset.read(1) == -9999.0, np.nan, dataset.read(1))[there]
+    return heights
+
+
+def _common(lattice, box, grid):
+    """Slices (rows, columns) of the grid, and of a tile, where both have pixels."""
+    left, top = (
+        round((grid.west - lattice.west) / lattice.pixel_m) - box.column,
+        round((lattice.top - grid.top) / lattice.pixel_m) - box.row,
+    )
+    first_row, first_column = max(top, 0), max(left, 0)
+    last_row, last_column = min(top + grid.height, box.height), min(left + grid.width, box.width)
+    rows, columns = (first_row, max(last_row, first_row)), (first_column, max(last_column, first_column))
+    return (
+        (slice(*(r - top for r in rows)), slice(*(c - left for c in columns))),
+        (slice(*rows), slice(*columns)),
+    )
+
+
+def contents(folder):
+    """Every file below a folder: bytes by relative name."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def textured(grid, seed=0):
+    """RGB (3, H, W) uint8 whose every pixel is told by its place on the map, whatever grid it is asked for."""
+    u, v = np.meshgrid(np.arange(grid.width), np.arange(grid.height))
+    xy = np.rint(grid.map_from_px(np.stack([u, v], axis=-1)) / (grid.dx / 2)).astype(np.int64)
+    mixed = (xy[..., 0] * 73_856_093) ^ (xy[..., 1] * 19_349_663) ^ (seed * 83_492_791)
+    return np.stack([(mixed >> shift) % 200 + 30 for shift in (3, 9, 15)]).astype(np.uint8)
+
+
+# A scene of several tiles that is compressed in tenths of a second: 2 x 2 tiles of DOP, 2 x 1 of DSM.
+WIDE_DOP = RasterGrid(704, 448, 400_900.0, 5_299_900.0, 2.0, -2.0)
+WIDE_DSM = RasterGrid(352, 224, 400_900.0, 5_299_900.0, 4.0, -4.0)
+
+
+def write_wide_scene(folder, crs=CRS):
+    """A textured DOP and a DSM of several tiles. Returns their paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    return (
+        write_raster(folder / "wide_dop.tif", textured(WIDE_DOP), WIDE_DOP, crs),
+        write_raster(folder / "wide_dsm.tif", dsm_heights(WIDE_DSM), WIDE_DSM, crs),
+    )
