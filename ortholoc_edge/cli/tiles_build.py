@@ -79,7 +79,14 @@ def _add_place(build: argparse.ArgumentParser) -> None:
     place.add_argument(
         "--corridor", type=float, metavar="M", help="width kept along a route, half to each side (default: 500)"
     )
-    place.add_argument("--crs", metavar="EPSG:N", help="CRS of sources that do not name theirs")
+    place.add_argument(
+        "--crs",
+        action="append",
+        type=_named_crs,
+        metavar="[PATTERN=]EPSG:N",
+        help="CRS of sources that do not name theirs, all or those whose names fit the pattern, as '*_33_*=EPSG:25833';"
+        " may be repeated, the first that fits counts; 'local' for local metres",
+    )
     place.add_argument(
         "--pack-crs", metavar="EPSG:N", help="projected CRS of the pack (default: that of most of the orthophoto)"
     )
@@ -179,7 +186,7 @@ def run(args: argparse.Namespace) -> int:
         dsm_gsd_m=args.dsm_gsd,
         max_size_bytes=args.max_size,
         area=None if args.area is None else read_area(args.area, args.corridor),
-        source_crs=args.crs,
+        source_crs=None if args.crs is None else tuple(args.crs),
         pack_crs=args.pack_crs,
         max_hole_cells=args.max_hole,
         features=args.features,
@@ -272,6 +279,14 @@ def _print_preview(preview: Preview, as_json: bool) -> None:
         rows.append(("features", f"about {facts['features_megabytes']:.2f} MB"))
     rows.append(("in all", f"about {facts['megabytes']:.2f} MB, give or take {facts['megabytes_sigma']:.2f}"))
     print("\n".join(f"{label:<12}{value}" for label, value in rows))
+
+
+def _named_crs(text: str) -> tuple[str, str]:
+    pattern, mark, crs = text.rpartition("=")
+    # WKT and PROJ strings have equals signs of their own, patterns of file names have none.
+    if not mark or any(c in pattern for c in "[+ "):
+        return "*", text
+    return pattern, crs
 
 
 def _bytes(text: str) -> int:

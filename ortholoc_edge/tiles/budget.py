@@ -16,7 +16,7 @@ from ortholoc_edge.geometry.arrays import BoolArray
 from ortholoc_edge.geometry.grid import RasterGrid
 from ortholoc_edge.tiles import encode
 from ortholoc_edge.tiles.features import bytes_per_mpx
-from ortholoc_edge.tiles.lattice import CROP_PX, PixelBox
+from ortholoc_edge.tiles.lattice import CROP_PX, LEVELS, PixelBox
 from ortholoc_edge.tiles.mosaic import dop_mosaic, dsm_mosaic
 from ortholoc_edge.tiles.plan import LayerPlan, Plan
 from ortholoc_edge.tiles.prepare import prepare
@@ -173,5 +173,5 @@ def _shrunk(values: npt.NDArray[Any], factor: int) -> npt.NDArray[Any]:
     count, rows, columns = values.shape
     blocks = values[:, : rows // factor * factor, : columns // factor * factor]
     blocks = blocks.reshape(count, rows // factor, factor, columns // factor, factor).mean(axis=(2, 4))
-    pads = [(0, 0), *((0, -side % 2 ** (encode.LEVELS - 1)) for side in blocks.shape[1:])]
+    pads = [(0, 0), *((0, -side % 2 ** (LEVELS - 1)) for side in blocks.shape[1:])]
     return np.pad(blocks, pads, mode="edge")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 import os
 import re
 import shutil
@@ -13,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -36,7 +38,6 @@ from ortholoc_edge.tiles.lattice import CROP_PX, Lattice, PixelBox
 from ortholoc_edge.tiles.manifest import (
     FORMAT,
     MANIFEST_NAME,
-    MOSAIC_NAMES,
     VERSION,
     Alignment,
     Dop,
@@ -77,9 +78,9 @@ _MAX_Z_ERROR_M = 0.02
 _MAX_Z_ERROR_PER_GSD = 1.0 / 20.0
 
 _BUILD_CACHE_BYTES = 256 * 2**20
-# Tiles that the check of DOP against DSM looks at: enough for a consensus, and memory that does not grow with the
-# area.
-_MAX_CHECKED_TILES = 24
+# Of the DOP, what the check of DOP against DSM reads: memory must not grow with the area.
+_MAX_CHECKED_BYTES = 256 * 2**20
+_GROUP_TILES = 3
 # Below the hidden folder: pieces of work, and sources that were made plain.
 _WORK = "work"
 # A size budget that was missed is tried again at lower quality, this often.
@@ -96,7 +97,7 @@ class PackOptions:
         dop_gsd_m, dsm_gsd_m: pixel sizes of the pack; None: those of the sources.
         max_size_bytes: of the whole pack; quality, then pixel sizes give way. None: no limit.
         area: what to keep; None: everything.
-        source_crs: of sources that do not say it.
+        source_crs: of sources that do not say it: one, or pairs of a pattern of names and a CRS; the first that fits.
         pack_crs: of the pack; None: that of most of the orthophoto.
         max_hole_cells: largest hole of the DSM that is closed, where its rim is a plane; 0: none.
         features: matcher whose features of the DOP are precomputed; None: none.
@@ -120,7 +121,7 @@ class PackOptions:
     dsm_gsd_m: float | None = None
     max_size_bytes: int | None = None
     area: Area | None = None
-    source_crs: str | None = None
+    source_crs: str | tuple[tuple[str, str], ...] | None = None
     pack_crs: str | None = None
     max_hole_cells: int = 16
     features: str | None = None
@@ -391,7 +392,7 @@ class _Build:
         shutil.rmtree(self._staged, ignore_errors=True)
         self._staged.mkdir()
         plan, settings = self._plan, self._settings
-        dop_sources, dsm_sources = self._prepared(plan.dop, 0.0), self._prepared(plan.dsm, 0.1)
+        dop_sources, dsm_sources = self._prepared()
         jobs: list[DopJob | DsmJob] = [
             DopJob(
                 tuple(dop_sources[k] for k in tile.sources),
@@ -432,15 +433,21 @@ class _Build:
 
     # -- work ------------------------------------------------------------------------------------------
 
-    def _prepared(self, layer: LayerPlan, start: float) -> list[Source]:
-        used = sorted({k for tile in layer.tiles for k in tile.sources})
-        jobs = {PrepareJob(layer.sources[k]): k for k in used}
-        sources = list(layer.sources)
-        for number, (job, source) in enumerate(self._run(list(jobs))):
-            assert isinstance(source, Source), "preparing gives a source"
-            sources[jobs[job]] = source
-            self._say(start + 0.1 * (number + 1) / len(jobs), f"reading sources ({layer.sources[0].kind.upper()})")
-        return sources
+    def _prepared(self) -> tuple[list[Source], list[Source]]:
+        """The sources of DOP and DSM in forms that windows can be read from."""
+        layers = self._plan.dop, self._plan.dsm
+        sources = tuple(list(layer.sources) for layer in layers)
+        places = {
+            PrepareJob(layer.sources[k]): (number, k)
+            for number, layer in enumerate(layers)
+            for k in sorted({k for tile in layer.tiles for k in tile.sources})
+        }
+        for done, (job, source) in enumerate(self._run(list(places)), 1):
+            assert isinstance(job, PrepareJob) and isinstance(source, Source), "preparing gives a source"
+            number, k = places[job]
+            sources[number][k] = source
+            self._say(0.2 * done / len(places), "reading sources")
+        return sources[0], sources[1]
 
     def _done(
         self, jobs: Sequence[DopJob | DsmJob | FeatureJob], start: float, end: float, what: str
@@ -451,9 +458,9 @@ class _Build:
         if len(waiting) < len(jobs):
             logger.info("%d of %d pieces are there from an earlier run", len(jobs) - len(waiting), len(jobs))
         done = len(jobs) - len(waiting)
-        for job, record in self._run(waiting):
-            assert isinstance(record, Record), "a tile gives a record"
-            records[job_name(job)] = record
+        for job, made in self._run(waiting):
+            assert isinstance(made, Record) and not isinstance(job, PrepareJob), "a tile gives a record"
+            records[job_name(job)] = made
             done += 1
             self._say(start + (end - start) * done / len(jobs), what)
         return [record for job in jobs if (record := records[job_name(job)]) is not None]
@@ -542,7 +549,7 @@ class _Build:
 
     def _tile(
         self, layer: str, lattice: Lattice, box: PixelBox, job: Job, record: Record
-    ) -> dict[str, object]:
+    ) -> dict[str, Any]:
         file = f"{layer}/{lattice.tile_name(box)}.tif"
         self._take(job, file)
         return {
@@ -660,14 +667,13 @@ class _Build:
             write_file(target, data)
             notes.append(FileNote(file=file, bytes=len(data), sha256=hashlib.sha256(data).hexdigest()))
         # Not listed: a GIS writes its statistics into them, and nothing in flight reads them.
-        for layer, file in zip((manifest.dop, manifest.dsm), MOSAIC_NAMES, strict=True):
-            write_file(self._staged / file, vrt.mosaic(layer, manifest.crs))
+        write_file(self._staged / vrt.DOP_VRT, vrt.mosaic(manifest.dop, manifest.crs))
+        write_file(self._staged / vrt.DSM_VRT, vrt.mosaic(manifest.dsm, manifest.crs))
         return msgspec.structs.replace(manifest, files=notes)
 
     def _checked(self, manifest: Manifest) -> Alignment | None:
-        """How DOP and DSM lie on each other, on tiles spread over the pack; what looks wrong is logged."""
-        step = -(-len(manifest.dop.tiles) // _MAX_CHECKED_TILES)
-        dop = manifest.dop.tiles[step // 2 :: step]
+        """How DOP and DSM lie on each other; what looks wrong is logged."""
+        dop = _groups(manifest.dop)
         boxes = [manifest.dop.lattice.grid(tile.box).bounds for tile in dop]
         dsm = [
             tile
@@ -734,3 +740,18 @@ def _cells(tile: DopTile | DsmTile, data: bytes) -> np.ndarray:
 
 def _touch(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+
+
+def _groups(dop: Dop) -> list[DopTile]:
+    """All tiles of a small orthophoto; of a large one groups of neighbours, spread over it.
+
+    Neighbours, because where a surface model lies a tile off, the right place must be among what is read.
+    """
+    groups: dict[tuple[int, int], list[DopTile]] = {}
+    for tile in dop.tiles:
+        column, row = dop.lattice.tile_key(tile.column, tile.row)
+        groups.setdefault((column // _GROUP_TILES, row // _GROUP_TILES), []).append(tile)
+    keys = sorted(groups)
+    share = _MAX_CHECKED_BYTES / sum(tile.bytes for tile in dop.tiles)
+    step = max(math.ceil(1.0 / share), 1)
+    return [tile for key in keys[min(step // 2, len(keys) - 1) :: step] for tile in groups[key]]

@@ -132,4 +132,4 @@ def _cog(source: str, options: dict[str, Any]) -> bytes:
             )
         except RasterioError as err:
             raise MapError(f"tile cannot be compressed ({err}); try --dop-compression jpeg") from err
-        return out.read()
+        return bytes(out.read())

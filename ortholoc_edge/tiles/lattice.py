@@ -108,12 +108,3 @@ class Lattice(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         side = self.tile_px * self.pixel_m
         east, north = self.west + column * side, self.top - (row + 1) * side
         return f"{math.floor(east + _SLACK_PX)}_{math.floor(north + _SLACK_PX)}"
-
-    def holds(self, grid: RasterGrid) -> bool:
-        """Whether a raster's pixels are pixels of this lattice, so that it need not be resampled."""
-        if abs(grid.dx - self.pixel_m) * grid.width > _SLACK_PX * self.pixel_m:
-            return False
-        if abs(grid.dy + self.pixel_m) * grid.height > _SLACK_PX * self.pixel_m:
-            return False
-        offsets = (grid.west - self.west) / self.pixel_m, (self.top - grid.top) / self.pixel_m
-        return all(abs(offset - round(offset)) <= _SLACK_PX for offset in offsets)

@@ -16,8 +16,6 @@ from ortholoc_edge.tiles.lattice import CROP_PX, Bounds, Lattice, PixelBox
 
 MANIFEST_NAME = "manifest.json"
 SIGNATURE_NAME = "manifest.sig"
-# For a GIS, not for flight: not listed, because a GIS writes statistics into them.
-MOSAIC_NAMES = ("dop.vrt", "dsm.vrt")
 FORMAT = "ortholoc-pack"
 VERSION = 2
 

@@ -19,7 +19,6 @@ from ortholoc_edge.tiles.georeference import Georeference, HeightOffsets
 from ortholoc_edge.tiles.layer import check_listed, read_listed
 from ortholoc_edge.tiles.manifest import (
     MANIFEST_NAME,
-    MOSAIC_NAMES,
     SIGNATURE_NAME,
     Dop,
     Dsm,
@@ -31,6 +30,7 @@ from ortholoc_edge.tiles.manifest import (
     read_manifest,
 )
 from ortholoc_edge.tiles.signature import require
+from ortholoc_edge.tiles.vrt import DOP_VRT, DSM_VRT
 
 logger = logging.getLogger(__name__)
 
@@ -118,7 +118,9 @@ class Pack:
             progress(note.file, done, len(notes))
             try:
                 if isinstance(note, Tile):
-                    problems += list(self._tile_problems(note, layers[note.file], crs))
+                    # One by one: what was found before an error counts too.
+                    for problem in self._tile_problems(note, layers[note.file], crs):
+                        problems.append(problem)
                 else:
                     self._read(note)
             except MapError as err:
@@ -163,7 +165,7 @@ class Pack:
     def _unlisted(self, listed: set[str]) -> list[str]:
         found = (path for path in self.path.rglob("*") if path.is_symlink() or not path.is_dir())
         names = (path.relative_to(self.path).as_posix() for path in found)
-        known = {*listed, MANIFEST_NAME, SIGNATURE_NAME, *MOSAIC_NAMES}
+        known = {*listed, MANIFEST_NAME, SIGNATURE_NAME, DOP_VRT, DSM_VRT}
         # A GIS leaves statistics beside what it has shown.
         return sorted(name for name in names if name not in known and not name.endswith(".aux.xml"))
 

@@ -16,7 +16,7 @@ from ortholoc_edge.errors import ConfigError, MapError
 from ortholoc_edge.tiles.area import Area, MapArea
 from ortholoc_edge.tiles.georeference import Georeference, VerticalDatum, VerticalKind, projected_crs
 from ortholoc_edge.tiles.lattice import Bounds, Lattice, PixelBox
-from ortholoc_edge.tiles.sources import Source
+from ortholoc_edge.tiles.sources import Source, is_copied, transform_caveat
 
 logger = logging.getLogger(__name__)
 
@@ -56,8 +56,7 @@ class LayerPlan:
 
     def resampled(self, index: int, crs: str | None) -> bool:
         """Whether a source's pixels are not those of the lattice."""
-        source = self.sources[index]
-        return source.crs != crs or not self.lattice.holds(source.grid)
+        return not is_copied(self.sources[index], self.lattice.grid(self.tiles[0].box), crs)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +101,7 @@ def make_plan(
             raise ConfigError(f"{name} {gsd}: must lie between {_MIN_GSD_M} and {_MAX_GSD_M} m")
     crs = _pack_crs(dop, dsm, pack_crs)
     map_area = None if area is None else area.on_map(crs)
+    _warn_of_rough_ways([*dop, *dsm], crs)
     dop_bounds, dsm_bounds = ([bounds_in(source, crs) for source in layer] for layer in (dop, dsm))
     _check_overlap(dop, dop_bounds, dsm, dsm_bounds)
     shared = _meeting(_union(dop_bounds), _union(dsm_bounds))
@@ -159,7 +159,8 @@ def bounds_in(source: Source, crs: str | None) -> Bounds:
 def lat_lon_of(crs: str, points: Sequence[tuple[float, float]]) -> np.ndarray:
     """Latitudes and longitudes (N, 2), degrees, in the CRS's own datum, of map points (N, 2)."""
     proj = pyproj.Proj(projected_crs(crs, crs))
-    lon, lat = proj(*np.asarray(points, dtype=np.float64).T, inverse=True)
+    xy = np.asarray(points, dtype=np.float64)
+    lon, lat = proj(xy[:, 0], xy[:, 1], inverse=True)
     return np.column_stack([lat, lon])
 
 
@@ -200,6 +201,15 @@ def _majority_crs(sources: Sequence[Source]) -> str:
         areas[crs] += _area_m2(bounds_in(source, crs))
     # Sorted, so that of two halves the same one wins on every machine.
     return max(sorted(areas), key=lambda crs: round(areas[crs]))
+
+
+def _warn_of_rough_ways(sources: Sequence[Source], crs: str | None) -> None:
+    """Once per system, where PROJ lacks the grids for the good way to the pack's."""
+    first = {source.crs: source for source in reversed(sources)}
+    for source in first.values():
+        caveat = transform_caveat(source, crs)
+        if caveat is not None:
+            logger.warning("%s", caveat)
 
 
 def _area_m2(bounds: Bounds) -> float:
@@ -249,7 +259,8 @@ def _pixels(sources: Sequence[Source], bounds: Sequence[Bounds], crs: str | None
         if source.crs != crs or not square:
             continue
         phase = grid.west % grid.dx, grid.top % grid.dx
-        key = (round(grid.dx, _SIZE_DIGITS), *(round(value / grid.dx, 2) % 1.0 for value in phase))
+        x, y = (round(value / grid.dx, 2) % 1.0 for value in phase)
+        key = round(grid.dx, _SIZE_DIGITS), x, y
         areas[key] += _area_m2(box)
         exact.setdefault(key, (grid.dx, phase))
     if areas:

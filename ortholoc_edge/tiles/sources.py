@@ -8,6 +8,7 @@ import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import date as calendar_day
+from fnmatch import fnmatch
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -109,7 +110,7 @@ def discover(
     paths: Sequence[Path],
     kind: Kind,
     *,
-    assign_crs: str | None = None,
+    assign_crs: str | Sequence[tuple[str, str]] | None = None,
     date: str | None = None,
     point_cell_m: float | None = None,
 ) -> list[Source]:
@@ -121,7 +122,7 @@ def discover(
     is named counts, and the files below it do not count again.
     Args:
         assign_crs: system of files that name none: world files, text. A file's own wins. "local": local
-            metres.
+            metres. Or pairs of a pattern of names, as "*_33_*", and a system; the first that fits counts.
         date: of acquisition of all of them; None: what their metadata or names say.
         point_cell_m: side of the cells that point clouds are gridded to; None: as `points.cloud_grid` chooses.
     Returns: in the order of ``paths``, by name within a folder, each file once.
@@ -129,7 +130,8 @@ def discover(
     """
     if date is not None and not re.fullmatch(r"\d{4}(-\d{2}(-\d{2})?)?", date):
         raise ConfigError(f"date {date!r}: write it as 2023, 2023-06 or 2023-06-04")
-    assigned = None if assign_crs in (None, LOCAL) else _parsed(str(assign_crs))
+    pairs = [("*", assign_crs)] if isinstance(assign_crs, str) else list(assign_crs or ())
+    systems = {crs: None if crs == LOCAL else _parsed(crs) for _, crs in pairs}
     notes = _Notes()
     sources: dict[tuple[Path, str | None], Source] = {}
     below: set[Path] = set()
@@ -140,8 +142,10 @@ def discover(
             if key in sources:
                 usable += 1
                 continue
+            fitting = next((crs for pattern, crs in pairs if fnmatch(found.name, pattern)), None)
+            assigned = None if fitting is None else systems[fitting]
             try:
-                source = _probe(found, kind, assign_crs, assigned, point_cell_m, notes)
+                source = _probe(found, kind, fitting, assigned, point_cell_m, notes)
             except _NotUsableError as err:
                 if found.asked:
                     raise MapError(str(err)) from err
@@ -163,7 +167,7 @@ def discover(
     if notes.skipped:
         logger.info("%d files passed over: %s", len(notes.skipped), _listed(notes.skipped))
     for own, names in notes.overruled.items():
-        logger.warning("%s: have the system %s, --crs %s is not used", _listed(names), own, assign_crs)
+        logger.warning("%s: have the system %s, --crs is not used for them", _listed(names), own)
     return chosen
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import importlib
 import logging
 import os
 import signal
@@ -373,18 +374,18 @@ def _collected(running: dict[Future[Any], _J]) -> Iterator[tuple[_J, Record | So
 
 def _on_dask(jobs: Sequence[_J], folder: Path, address: str) -> Iterator[tuple[_J, Record | Source]]:
     try:
-        from dask.distributed import Client, as_completed
+        distributed: Any = importlib.import_module("dask.distributed")
     except ImportError as err:
         raise ConfigError("--dask needs Dask; install it with: pip install 'ortholoc-edge[dask]'") from err
     try:
-        client = Client(address, timeout="5s", set_as_default=False)
+        client = distributed.Client(address, timeout="5s", set_as_default=False)
     except (OSError, ValueError) as err:
         raise ConfigError(f"--dask {address}: no scheduler answers ({err}); start one with: dask scheduler") from err
     with client:
         _check_shared(client, folder, address)
         futures = {client.submit(_guarded, job, folder, key=f"{job_name(job)}", pure=False): job for job in jobs}
         try:
-            for future in as_completed(list(futures), loop=client.loop):
+            for future in distributed.as_completed(list(futures), loop=client.loop):
                 if future.status != "finished":
                     raise MapError(f"--dask {address}: a task failed ({future.exception()}); see the workers' logs")
                 yield futures.pop(future), _unpacked(future.result())

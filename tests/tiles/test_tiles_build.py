@@ -108,7 +108,7 @@ def test_manifest_tells_what_was_stated(scene, tmp_path):
     assert manifest.vertical.amsl_minus_map_m == -46.0
     assert (manifest.dop.gsd_m, manifest.dsm.gsd_m) == (0.1, 0.2)
     for layer, grid, name in ((manifest.dop, DOP_GRID, "dop_source.tif"), (manifest.dsm, DSM_GRID, "dsm_source.tif")):
-        assert layer.lattice.holds(grid)
+        assert on_lattice(grid, layer.lattice.grid(layer.tiles[0].box))
         assert [(one.name, one.crs, one.gsd_m, one.resampled) for one in layer.sources] == [
             (name, CRS, layer.gsd_m, False)
         ]
