@@ -227,9 +227,14 @@ class Cog:
         """A rasterio dataset of one level, to be closed by the caller. Raises: MapError, UndecodableError."""
         if self._memory is None:
             raise MapError(f"{self.path}: already closed; open the pack again")
+        if not self._data:
+            # To rasterio an empty file is one to be written.
+            raise UndecodableError(f"{self.path}: empty; copy the pack again")
+        # Nothing but a TIFF: other formats of GDAL's lead to other files.
+        overview = {} if level == 0 else {"overview_level": level - 1}
         try:
             with quiet_georeference():
-                return self._memory.open() if level == 0 else self._memory.open(overview_level=level - 1)
+                return self._memory.open(driver="GTiff", **overview)
         except (RasterioError, OSError) as err:
             raise UndecodableError(f"{self.path}: cannot be opened ({err}); copy the pack again") from err
 

@@ -34,7 +34,7 @@ CRS = "EPSG:32633"
 # Pixel (0, 0) of the arrays lies inside of the first tile, so that tiles at the rim are cropped.
 DOP_LATTICE = Lattice(west=400_000.0, top=5_300_000.0, pixel_m=0.25, tile_px=512, levels=LEVELS)
 DSM_LATTICE = Lattice(west=400_000.0, top=5_300_000.0, pixel_m=1.0, tile_px=128, levels=LEVELS)
-DOP_CORNER, DSM_CORNER = (192, 128), (64, 0)
+DOP_CORNER, DSM_CORNER = (320, 128), (64, 0)
 VERTICAL = VerticalDatum(
     kind="orthometric", amsl_minus_map_m=0.0, ellipsoid_minus_map_m=46.0, derivation="test", amsl_sigma_m=1.0
 )
@@ -139,7 +139,12 @@ def _note(folder: Path, name: str, data: bytes) -> dict[str, Any]:
     path = folder / name
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data)
-    return {"file": name, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    return {"file": name} | contents_note(data)
+
+
+def contents_note(data: bytes) -> dict[str, Any]:
+    """What a manifest says of a file's bytes."""
+    return {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
 
 
 def _contents(data: bytes, valid_fraction: float) -> dict[str, Any]:

@@ -1,136 +1,181 @@
+"""What flies reads: windows of many tiles as of one raster, and holes where tiles are missing or damaged."""
+
+import functools
+import hashlib
 import logging
 import shutil
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
+import msgspec
 import numpy as np
+import packs
 import pytest
-import rasterio
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterio.env import get_gdal_config
-from rasterio.windows import from_bounds
-from tile_rasters import DOP_GRID, DSM_GRID, centres, colours, plane, write_raster
+from rasterio.io import MemoryFile
 
 from ortholoc_edge.errors import MapError
-from ortholoc_edge.tiles.build import PackOptions, build_pack
-from ortholoc_edge.tiles.cog import Block, Cog, MapDamagedError
+from ortholoc_edge.geometry.grid import bilinear
+from ortholoc_edge.tiles import encode, store
+from ortholoc_edge.tiles.cog import MAX_HANDLES, Cog, PixelWindow
+from ortholoc_edge.tiles.lattice import LEVELS, PixelBox
+from ortholoc_edge.tiles.manifest import MANIFEST_NAME, FeatureLayer, FeatureTile, write_manifest
 from ortholoc_edge.tiles.pack import Pack
-from ortholoc_edge.tiles.store import MapStore
+from ortholoc_edge.tiles.store import MapStore, WindowTooLargeError
 
+DOP_PX, DSM_PX = (960, 704), (320, 256)
+DOP_BOX, DSM_BOX = PixelBox(*packs.DOP_CORNER, *DOP_PX), PixelBox(*packs.DSM_CORNER, *DSM_PX)
+DOP_GRID, DSM_GRID = packs.DOP_LATTICE.grid(DOP_BOX), packs.DSM_LATTICE.grid(DSM_BOX)
 WEST, SOUTH, EAST, NORTH = DOP_GRID.bounds
 
 
-@pytest.fixture(scope="module")
-def plane_store(plane_pack):
-    with MapStore(plane_pack) as store:
-        yield store
+def pixels(width, height):
+    v, u = np.mgrid[:height, :width]
+    return np.stack([1 + u % 251, 1 + v % 241, 1 + u // 251 * 40 + v // 241 * 7]).astype(np.uint8)
+
+
+@functools.cache
+def scene():
+    """Every pixel tells where it is; holes that cross tiles' borders."""
+    rng = np.random.default_rng(5)
+    rgb = pixels(*DOP_PX)
+    valid = np.ones(rgb.shape[1:], dtype=bool)
+    valid[300:450, 150:320] = False
+    heights = rng.uniform(250.0, 420.0, (DSM_PX[1], DSM_PX[0])).astype(np.float32)
+    heights[100:180, 40:90] = np.nan
+    heights[rng.random(heights.shape) < 0.001] = np.nan
+    return rgb, valid, heights
 
 
 @pytest.fixture(scope="module")
-def holed_store(holed_pack):
-    with MapStore(holed_pack) as store:
-        yield store
+def pack(tmp_path_factory):
+    rgb, valid, heights = scene()
+    return packs.write_pack(tmp_path_factory.mktemp("many") / "pack", rgb, heights, valid=valid, max_z_error_m=0.0)
 
 
-def test_levels_share_the_extent_and_hold_the_plane(plane_store):
-    """Half pixels: the value at each pixel's centre must be the plane's there, at every level."""
-    assert len(plane_store.dop_grids) == 3
-    assert len(plane_store.dsm_grids) == 2
-    for dop_grid in plane_store.dop_grids:
-        assert np.allclose(dop_grid.bounds, plane_store.bounds, rtol=0, atol=1e-6)
-        window = plane_store.read(plane_store.bounds, dop_grid.gsd_m)
-        assert window.dop_grid == dop_grid
-        assert window.dop_valid.all()
-        error = window.dop - colours(centres(window.dop_grid))
-        assert np.abs(error).mean() < 1.0
-    for dsm_grid in plane_store.dsm_grids:
-        window = plane_store.read(plane_store.bounds, 0.1, dsm_grid.gsd_m)
-        assert window.dsm_grid == dsm_grid
-        error = window.dsm - plane(centres(window.dsm_grid))
-        # Half a cell of the second level would be 0.06 m.
-        assert np.abs(error).max() < 0.0101
-        assert abs(error.mean()) < 1e-3
+@pytest.fixture(scope="module")
+def whole():
+    """The same as two files of one piece."""
+    rgb, valid, heights = scene()
+    dop = Cog(encode.dop_cog(rgb, valid, DOP_GRID, packs.CRS, "webp", 100), Path("whole dop"))
+    dsm = Cog(encode.dsm_cog(heights, DSM_GRID, packs.CRS, 0.0), Path("whole dsm"))
+    with dop, dsm:
+        yield dop, dsm
 
 
-def test_no_level_of_the_orthophoto_is_shifted(scene, tmp_path):
-    """Waves tell a shift to a hundredth of a pixel, where a ramp drowns in GDAL's rounding up of halves."""
-
-    def waves(xy):
-        x, y = 2 * np.pi * (xy[..., 0] - WEST) / 8.0, 2 * np.pi * (xy[..., 1] - SOUTH) / 9.0
-        slopes = 60 * 2 * np.pi * np.stack([np.cos(x) / 8.0, np.cos(y) / 9.0, np.ones_like(x)], axis=-1)
-        return 127 + 60 * np.sin(x) + 60 * np.sin(y), slopes
-
-    grey = np.rint(waves(centres(DOP_GRID))[0]).astype(np.uint8)
-    dop = write_raster(tmp_path / "waves.tif", grey[None], DOP_GRID)
-    with MapStore(build_pack(dop, scene[1], tmp_path / "pack", PackOptions(quality=95))) as store:
-        for grid in store.dop_grids:
-            value, slopes = waves(centres(grid))
-            error = value - store.read(store.bounds, grid.gsd_m).dop[..., 1]
-            shift_m = np.linalg.lstsq(slopes.reshape(-1, 3), error.reshape(-1), rcond=None)[0][:2]
-            assert np.abs(shift_m).max() < 0.02 * grid.gsd_m
+@pytest.fixture(scope="module")
+def sound(pack):
+    with MapStore(pack) as opened:
+        yield opened
 
 
-def test_window_is_what_rasterio_reads_there(holed_store, holed_pack):
-    bounds = (WEST + 55.0, SOUTH + 47.0, WEST + 75.0, SOUTH + 75.0)
-    window = holed_store.read(bounds, 0.1, 0.2)
-    with rasterio.open(holed_pack.path / "dop.tif") as dataset:
-        place = from_bounds(*window.dop_grid.bounds, dataset.transform)
-        assert np.array_equal(np.moveaxis(window.dop, -1, 0), dataset.read(window=place))
-        assert np.array_equal(window.dop_valid, dataset.dataset_mask(window=place) > 0)
-    with rasterio.open(holed_pack.path / "dsm.tif") as dataset:
-        heights = dataset.read(1, window=from_bounds(*window.dsm_grid.bounds, dataset.transform))
-    assert np.array_equal(np.isnan(window.dsm), heights == -9999.0)
-    assert np.array_equal(window.dsm[~np.isnan(window.dsm)], heights[heights != -9999.0])
-    assert 0 < np.isnan(window.dsm).mean() < 1
-    assert 0 < window.dop_valid.mean() < 1
+@pytest.fixture
+def copied(pack, tmp_path):
+    return shutil.copytree(pack.path, tmp_path / "pack")
 
 
-def test_nodata_does_not_bleed_into_overviews(holed_store):
-    for grid in holed_store.dsm_grids:
-        window = holed_store.read(holed_store.bounds, 0.1, grid.gsd_m)
-        valid = ~np.isnan(window.dsm)
-        error = np.abs(window.dsm - plane(centres(window.dsm_grid)))[valid]
-        # Beside the hole an overview cell averages the part that has data.
-        assert error.max() < grid.gsd_m
-        assert valid.mean() == pytest.approx(1 - 130 * 137 / (739 * 655), abs=0.01)
-    for grid in holed_store.dop_grids:
-        window = holed_store.read(holed_store.bounds, grid.gsd_m)
-        error = np.abs(window.dop - colours(centres(window.dop_grid)))[window.dop_valid]
-        assert np.percentile(error, 99) < 6.0
+def same(a, b):
+    return np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
+
+
+def everything(opened, level=0):
+    """(DOP, validity, DSM) of all tiles."""
+    dop, dsm = opened.dop_grids[level], opened.dsm_grids[level]
+    return (
+        *opened._dop.read_image(level, PixelWindow(0, 0, dop.width, dop.height)),
+        opened._dsm.read_heights(level, PixelWindow(0, 0, dsm.width, dsm.height)),
+    )
+
+
+# -- many tiles as one ---------------------------------------------------------------------------------
+
+
+def test_scene_is_cut_into_tiles_whose_rims_are_cropped(pack, sound):
+    assert (len(pack.manifest.dop.tiles), len(pack.manifest.dsm.tiles)) == (6, 6)
+    assert {(t.width, t.height) for t in pack.manifest.dop.tiles} >= {(192, 384), (512, 320)}
+    assert len(sound.dop_grids) == len(sound.dsm_grids) == LEVELS
+    assert sound.dop_grids[0] == DOP_GRID
+    assert sound.dsm_grids[0] == DSM_GRID
+    assert sound.bounds == DOP_GRID.bounds
+    assert sound.damaged == []
+    rgb, valid, heights = scene()
+    dop, dop_valid, dsm = everything(sound)
+    assert same(dop[valid], np.moveaxis(rgb, 0, -1)[valid])
+    assert same(dop_valid, valid)
+    assert same(dsm, heights)
+
+
+@settings(max_examples=150, deadline=None)
+@given(data=st.data(), level=st.integers(0, LEVELS - 1))
+def test_any_window_is_that_of_the_whole_raster(sound, whole, data, level):
+    for opened, one, grids in ((sound._dop, whole[0], sound.dop_grids), (sound._dsm, whole[1], sound.dsm_grids)):
+        grid = grids[level]
+        assert one.grids[level] == grid
+        column, row = data.draw(st.integers(0, grid.width - 1)), data.draw(st.integers(0, grid.height - 1))
+        width = data.draw(st.integers(1, grid.width - column))
+        window = PixelWindow(column, row, width, data.draw(st.integers(1, grid.height - row)))
+        if one is whole[0]:
+            rgb, valid = opened.read_image(level, window)
+            bands, mask = one.read_image(level, window)
+            assert same(valid, mask)
+            assert same(rgb[valid], np.moveaxis(bands, 0, -1)[mask])
+        else:
+            assert same(opened.read_heights(level, window), one.read_heights(level, window))
+
+
+@settings(max_examples=100, deadline=None)
+@given(points=st.lists(st.tuples(st.floats(-20, 400), st.floats(-20, 340)), max_size=40))
+def test_heights_are_bilinear_also_across_tiles(sound, points):
+    xy = np.add(np.array(points).reshape(-1, 2), (DSM_GRID.west, DSM_GRID.bounds[1]))
+    assert np.allclose(
+        sound.heights(xy), bilinear(scene()[2], DSM_GRID.px_from_map(xy)), rtol=0, atol=1e-6, equal_nan=True
+    )
+
+
+def test_heights_on_the_seams(sound):
+    """Half way between the last cell of one tile and the first of the next: the mean of both."""
+    heights = scene()[2]
+    columns = np.array([63, 191])  # the last of their tiles: the first tile is cropped by 64
+    rows = np.full(2, 20)
+    assert np.isfinite(heights[20, [63, 64, 191, 192]]).all()
+    found = sound.heights(DSM_GRID.map_from_px(np.stack([columns + 0.5, rows], axis=-1)))
+    assert np.allclose(found, (heights[20, columns] + heights[20, columns + 1]) / 2.0, rtol=0, atol=1e-4)
+
+
+def test_ground_near_is_the_median_of_what_is_there(sound):
+    at = DSM_GRID.map_from_px([200.0, 200.0])
+    assert sound.ground_near(at) == pytest.approx(335.0, abs=60.0)
+    assert sound.ground_near(DSM_GRID.map_from_px([65.0, 140.0])) is not None  # in the hole: from around it
+    assert sound.ground_near((WEST - 5000.0, SOUTH)) is None
+    assert sound.ground_near((np.nan, SOUTH)) is None
 
 
 @pytest.mark.parametrize(
     ("gsd_m", "dop_level", "dsm_level"),
-    [
-        (0.01, 0, 0),
-        (0.1, 0, 0),
-        (0.13, 0, 0),
-        (0.15, 1, 1),
-        (0.2, 1, 1),
-        (0.27, 1, 1),
-        (0.3, 2, 1),
-        (50.0, 2, 1),
-    ],
+    [(0.01, 0, 0), (0.25, 0, 0), (0.34, 0, 0), (0.36, 1, 0), (0.5, 1, 0), (0.72, 2, 1), (1.0, 2, 1), (50.0, 4, 3)],
 )
-def test_level_is_the_coarsest_that_suits(plane_store, gsd_m, dop_level, dsm_level):
-    window = plane_store.read((WEST + 50, SOUTH + 50, WEST + 80, SOUTH + 80), gsd_m)
-    assert window.dop_grid.dx == plane_store.dop_grids[dop_level].dx
-    assert window.dsm_grid.dx == plane_store.dsm_grids[dsm_level].dx
-    finest = plane_store.read((WEST + 50, SOUTH + 50, WEST + 80, SOUTH + 80), gsd_m, dsm_gsd_m=0.01)
-    assert finest.dsm_grid.dx == DSM_GRID.dx
+def test_level_is_the_coarsest_that_suits(sound, gsd_m, dop_level, dsm_level):
+    """Of the DOP up to the square root of two coarser, of the DSM twice the DOP's pixels."""
+    region = (WEST + 50, SOUTH + 50, WEST + 150, SOUTH + 150)
+    window = sound.read(region, gsd_m)
+    assert window.dop_grid.dx == sound.dop_grids[dop_level].dx
+    assert window.dsm_grid.dx == sound.dsm_grids[dsm_level].dx
+    assert sound.read(region, gsd_m, dsm_gsd_m=0.01).dsm_grid.dx == DSM_GRID.dx
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(
-    corner=st.tuples(st.floats(-60, 200), st.floats(-60, 200)),
-    size=st.tuples(st.floats(0.001, 150), st.floats(0.001, 150)),
-    gsd=st.sampled_from([0.1, 0.2, 0.4]),
+    corner=st.tuples(st.floats(-60, 280), st.floats(-60, 210)),
+    size=st.tuples(st.floats(0.001, 300), st.floats(0.001, 300)),
+    gsd=st.sampled_from([0.25, 0.5, 1.0, 4.0]),
 )
-def test_window_covers_the_region_and_no_pixel_more(plane_store, corner, size, gsd):
+def test_window_covers_the_region_and_no_pixel_more(sound, corner, size, gsd):
     west, south = WEST + corner[0], SOUTH + corner[1]
     bounds = (west, south, west + size[0], south + size[1])
     inside = (max(bounds[0], WEST), max(bounds[1], SOUTH), min(bounds[2], EAST), min(bounds[3], NORTH))
-    window = plane_store.read(bounds, gsd)
+    window = sound.read(bounds, gsd)
     # Within a millionth of a pixel of the edge either answer is right.
     if inside[0] > inside[2] or inside[1] > inside[3]:
         assert window is None
@@ -146,13 +191,16 @@ def test_window_covers_the_region_and_no_pixel_more(plane_store, corner, size, g
     assert outer[2] >= inside[2] - slack > outer[2] - grid.dx - 2 * slack
     assert outer[1] <= inside[1] + slack < outer[1] - grid.dy + 2 * slack
     assert outer[3] >= inside[3] - slack > outer[3] + grid.dy - 2 * slack
-    # Pixels stay on the level's own lattice.
-    level = next(one for one in plane_store.dop_grids if one.dx == grid.dx)
-    offset = (grid.west - level.west) / level.dx, (grid.top - level.top) / level.dy
-    assert np.allclose(offset, np.rint(offset), atol=1e-6)
+    # Pixels stay on the level's own lattice, and their contents belong there.
+    level = [one.dx for one in sound.dop_grids].index(grid.dx)
+    whole_grid = sound.dop_grids[level]
+    column, row = (round(v) for v in ((grid.west - WEST) / grid.dx, (grid.top - NORTH) / grid.dy))
+    assert grid == whole_grid.crop(column, row, grid.width, grid.height)
+    rgb, valid = sound._dop.read_image(level, PixelWindow(column, row, grid.width, grid.height))
+    assert same(window.dop, rgb)
+    assert same(window.dop_valid, valid)
     # The surface model reaches beyond the orthophoto's pixel centres, for bilinear look-ups.
-    corners = grid.map_from_px([[0, 0], [grid.width - 1, grid.height - 1]])
-    cells = window.dsm_grid.px_from_map(corners)
+    cells = window.dsm_grid.px_from_map(grid.map_from_px([[0, 0], [grid.width - 1, grid.height - 1]]))
     dsm_outer, dsm_map = window.dsm_grid.bounds, DSM_GRID.bounds
     if dsm_outer[0] > dsm_map[0] + 1e-6:
         assert cells[0, 0] >= 0.5
@@ -160,10 +208,10 @@ def test_window_covers_the_region_and_no_pixel_more(plane_store, corner, size, g
         assert cells[1, 0] <= window.dsm_grid.width - 1.5
 
 
-def test_region_outside_gives_none(plane_store):
-    assert plane_store.read((WEST - 50, SOUTH, WEST - 1, NORTH), 0.1) is None
-    assert plane_store.read((WEST - 50, SOUTH, WEST, NORTH), 0.1) is None
-    assert plane_store.read((WEST, NORTH + 1, EAST, NORTH + 9), 0.1) is None
+def test_region_outside_gives_none(sound):
+    assert sound.read((WEST - 50, SOUTH, WEST - 1, NORTH), 0.25) is None
+    assert sound.read((WEST - 50, SOUTH, WEST, NORTH), 0.25) is None
+    assert sound.read((WEST, NORTH + 1, EAST, NORTH + 9), 0.25) is None
 
 
 @pytest.mark.parametrize(
@@ -176,94 +224,131 @@ def test_region_outside_gives_none(plane_store):
         ((WEST, SOUTH, EAST, NORTH), 0.1, -1.0),
     ],
 )
-def test_unusable_requests_are_refused(plane_store, arguments):
+def test_unusable_requests_are_refused(sound, arguments):
     with pytest.raises(ValueError, match=r"unusable|positive"):
-        plane_store.read(*arguments)
+        sound.read(*arguments)
 
 
-def test_too_large_a_window_is_refused(plane_pack):
-    with MapStore(plane_pack, max_pixels=100_000) as store:
-        with pytest.raises(MapError, match="exceeds 100000 px"):
-            store.read(store.bounds, 0.1)
-        assert store.read((WEST, SOUTH, WEST + 20, SOUTH + 20), 0.1) is not None
+def test_too_large_a_window_is_refused(pack):
+    with MapStore(pack, max_pixels=100_000) as opened:
+        with pytest.raises(WindowTooLargeError, match="exceeds 100000 px"):
+            opened.read(opened.bounds, 0.25)
+        assert opened.read((WEST, SOUTH, WEST + 20, SOUTH + 20), 0.25) is not None
 
 
-def test_arrays_cannot_be_changed_by_a_consumer(plane_store):
-    window = plane_store.read((WEST, SOUTH, WEST + 20, SOUTH + 20), 0.1)
+def test_arrays_cannot_be_changed_by_a_consumer(sound):
+    window = sound.read((WEST, SOUTH, WEST + 140, SOUTH + 140), 0.25)
     for array in (window.dop, window.dop_valid, window.dsm):
         assert not array.flags.writeable
         assert array.flags.c_contiguous
 
 
-@given(points=st.lists(st.tuples(st.floats(-20, 170), st.floats(-20, 150)), max_size=30))
-@settings(max_examples=60, deadline=None)
-def test_heights_are_bilinear_and_nan_outside(plane_store, points):
-    xy = np.add(np.array(points).reshape(-1, 2), (WEST, SOUTH))
-    heights = plane_store.heights(xy)
-    px = DSM_GRID.px_from_map(xy)
-    inside = ((px >= 0) & (px <= (DSM_GRID.width - 1, DSM_GRID.height - 1))).all(axis=1)
-    assert np.array_equal(np.isfinite(heights), inside)
-    assert np.allclose(heights[inside], plane(xy[inside]), rtol=0, atol=0.0101)
+def test_area_without_tiles_is_a_hole(tmp_path, sound):
+    """An L-shaped area, or a corridor: tiles that never were."""
+    rgb, valid, heights = scene()
+    gaps = frozenset({("dop", 1, 1), ("dsm", 1, 0), ("dsm", 1, 1)})
+    sparse = packs.write_pack(tmp_path, rgb, heights, valid=valid, leave_out=gaps, max_z_error_m=0.0)
+    assert sparse.verify() == []
+    with MapStore(sparse) as opened:
+        assert opened.damaged == []
+        dop, dop_valid, dsm = everything(opened)
+        before = everything(sound)
+        in_gap = np.zeros_like(dop_valid)
+        in_gap[512 - 128 :, 512 - 320 : 1024 - 320] = True
+        assert not dop_valid[in_gap].any()
+        assert same(dop_valid[~in_gap], before[1][~in_gap])
+        assert same(dop[dop_valid], before[0][dop_valid])
+        assert np.isnan(dsm[:256, 64:192]).all()
+        assert same(dsm[:, 192:], before[2][:, 192:])
+        beside = DSM_GRID.map_from_px([[63.0, 20.0], [63.5, 20.0], [100.0, 20.0]])
+        assert list(np.isfinite(opened.heights(beside))) == [True, False, False]
 
 
-def test_heights_at_cell_centres_are_the_raster_across_blocks(holed_store, holed_pack):
-    """Centres carry all weight themselves, also where a neighbour is nodata or past the edge."""
-    with rasterio.open(holed_pack.path / "dsm.tif") as dataset:
-        raster = dataset.read(1).astype(np.float64)
-    raster[raster == -9999.0] = np.nan
-    columns, rows = np.meshgrid([0, 299, 300, 436, 437, 511, 512, 738], [0, 199, 200, 330, 511, 512, 654])
-    px = np.stack([columns, rows], axis=-1).reshape(-1, 2)
-    found = holed_store.heights(DSM_GRID.map_from_px(px))
-    exact = DSM_GRID.px_from_map(DSM_GRID.map_from_px(px))
-    # Positions in metres round; short of the centre a nodata neighbour gets a weight of 1e-10.
-    clean = (exact == px).all(axis=1)
-    assert clean.any()
-    expected = raster[px[:, 1], px[:, 0]]
-    assert np.allclose(found[clean], expected[clean], rtol=0, atol=1e-9, equal_nan=True)
+# -- memory, threads, life -----------------------------------------------------------------------------
 
 
-def test_heights_beside_the_hole_are_nan(holed_store):
-    edge = DSM_GRID.map_from_px([[299.5, 260.0], [298.5, 260.0], [350.0, 260.0], [float("nan"), 3.0]])
-    assert np.array_equal(np.isnan(holed_store.heights(edge)), [True, False, True, True])
-
-
-def test_several_threads_read_what_one_does(holed_store):
+def test_several_threads_read_what_one_does(pack):
     rng = np.random.default_rng(7)
-    corners = rng.uniform((WEST, SOUTH), (EAST - 30, NORTH - 30), size=(60, 2))
-    gsds = [0.1, 0.2, 0.4] * 20
-    requests = [((x, y, x + 25.0, y + 20.0), gsd) for (x, y), gsd in zip(corners, gsds, strict=True)]
+    corners = rng.uniform((WEST, SOUTH), (EAST - 60, NORTH - 60), size=(60, 2))
+    requests = [((x, y, x + 90.0, y + 70.0), 0.25 * 2 ** (k % 4)) for k, (x, y) in enumerate(corners)]
 
-    def read(request):
-        window = holed_store.read(*request)
-        return window.dop, window.dop_valid, window.dsm, holed_store.heights(corners)
+    def read(opened, request):
+        window = opened.read(*request)
+        return window.dop, window.dop_valid, window.dsm, opened.heights(corners)
 
-    alone = [read(request) for request in requests]
-    with ThreadPoolExecutor(8) as pool:
-        together = list(pool.map(read, requests))
-    for one, other in zip(alone, together, strict=True):
-        assert all(np.array_equal(a, b, equal_nan=a.dtype.kind == "f") for a, b in zip(one, other, strict=True))
+    with MapStore(pack) as one, MapStore(pack) as other, ThreadPoolExecutor(8) as pool:
+        alone = [read(one, request) for request in requests]
+        together = list(pool.map(lambda request: read(other, request), requests))
+    for a, b in zip(alone, together, strict=True):
+        assert all(map(same, a, b))
 
 
-def test_cache_is_bounded_and_memory_is_the_files(plane_pack):
-    with MapStore(plane_pack, cache_bytes=3 * 2**20) as store:
+def test_open_handles_are_bounded(pack, monkeypatch):
+    opened_levels = []
+    open_level = Cog.open_level
+    monkeypatch.setattr(Cog, "open_level", lambda cog, level: opened_levels.append(level) or open_level(cog, level))
+    with MapStore(pack) as opened:
+        assert opened_levels == []  # nothing before it is asked for
+        for level in (*range(LEVELS), 0):
+            everything(opened, level)
+            assert len(opened._dop._handles) == min(MAX_HANDLES, len(opened_levels))
+        # The same view again opens nothing.
+        region = (WEST + 90, SOUTH + 90, WEST + 190, SOUTH + 170)
+        opened.read(region, 0.25)
+        opened.heights(DSM_GRID.map_from_px([[150.0, 150.0]]))
+        count = len(opened_levels)
+        opened.read(region, 0.25)
+        opened.heights(DSM_GRID.map_from_px([[150.0, 150.0]]))
+        assert len(opened_levels) == count
+        handles = opened._dop._handles
+    assert len(handles) == 0
+
+
+def test_bytes_in_memory_are_not_copied_for_gdal():
+    def resident():
+        return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+
+    data = b"\x01" * 64_000_000
+    before = resident()
+    with MemoryFile(data):
+        assert resident() - before < 16_000_000
+
+
+def test_cache_is_bounded_and_memory_is_the_files(pack):
+    with MapStore(pack, cache_bytes=3 * 2**20) as opened:
         assert get_gdal_config("GDAL_CACHEMAX") == 3 * 2**20
-        assert store.compressed_bytes == sum((plane_pack.path / f).stat().st_size for f in ("dop.tif", "dsm.tif"))
-        assert store.read(store.bounds, 0.1).dop.shape == (1307, 1475, 3)
+        assert opened.compressed_bytes == sum(path.stat().st_size for path in pack.path.glob("d*/*.tif"))
 
 
-def test_files_are_not_needed_after_loading(plane_pack, tmp_path):
-    path = shutil.copytree(plane_pack.path, tmp_path / "pack")
-    with MapStore(Pack.open(path)) as store:
-        shutil.rmtree(path)
-        assert store.read(store.bounds, 0.1) is not None
+def test_pack_over_the_budget_is_refused_before_anything_is_read(pack, monkeypatch):
+    size = sum(path.stat().st_size for path in pack.path.glob("d*/*.tif"))
+    with MapStore(pack, memory_bytes=size) as opened:
+        assert opened.compressed_bytes == size
+    monkeypatch.setattr(store, "LoadedLayer", None)
+    remedies = r"MiB are allowed.*--area.*--max-size.*map\.memory_mb"
+    with pytest.raises(MapError, match=rf"{size / 2**20:.0f} MiB to be held.*{remedies}"):
+        MapStore(pack, memory_bytes=size - 1)
 
 
-def test_closed_store_says_so(plane_pack):
-    store = MapStore(plane_pack)
-    store.close()
-    store.close()
+def test_files_are_not_needed_after_loading(copied, sound):
+    with MapStore(Pack.open(copied)) as opened:
+        shutil.rmtree(copied)
+        assert all(map(same, everything(opened), everything(sound)))
+
+
+def test_closed_store_says_so(pack, caplog):
+    opened = MapStore(pack)
+    opened.close()
+    opened.close()
     with pytest.raises(MapError, match="closed"):
-        store.read(plane_pack.manifest.dop.grid.raster_grid().bounds, 0.4)
+        opened.read(DOP_GRID.bounds, 1.0)
+    with pytest.raises(MapError, match="closed"):
+        opened.heights([(WEST + 100, SOUTH + 100)])
+    assert opened.damaged == []
+    assert caplog.text == ""
+
+
+# -- damage --------------------------------------------------------------------------------------------
 
 
 def flip(path, at):
@@ -272,80 +357,227 @@ def flip(path, at):
     path.write_bytes(data)
 
 
-def offset_of(path, column, row, level=0):
-    with rasterio.open(path) as dataset:
-        item = dataset.get_tag_item(f"BLOCK_OFFSET_{column}_{row}", "TIFF", bidx=1, ovr=level - 1 if level else None)
-    return int(item)
+def tile_of(pack, layer, column, row):
+    described = getattr(pack.manifest, layer)
+    return next(t for t in described.tiles if described.lattice.tile_key(t.column, t.row) == (column, row))
 
 
-@pytest.mark.parametrize("name", ["dop.tif", "dsm.tif"])
-def test_flipped_byte_in_a_tile_is_found_named_and_flown_around(copied, name, caplog):
-    file = copied / name
-    flip(file, offset_of(file, 1, 0) + 300)
-    pack = Pack.open(copied)
-
-    problems = pack.verify()
-    assert len(problems) == 2
-    assert "SHA-256" in problems[0]
-    assert name in problems[1]
-    assert "column 1, row 0 of level 0" in problems[1]
-
-    with pytest.raises(MapError, match=rf"{name}: SHA-256 differs.*copy it again"):
-        MapStore(pack)
-    with caplog.at_level(logging.WARNING):
-        store = MapStore(pack, tolerate_damage=True)
-    assert "1 tiles cannot be used" in caplog.text
-    with store:
-        size = 512 * (DOP_GRID.dx if name == "dop.tif" else DSM_GRID.dx)
-        bad = WEST + 1.2 * size, NORTH - 0.5 * size
-        around = (bad[0] - 1, bad[1] - 1, bad[0] + 1, bad[1] + 1)
-        with pytest.raises(MapDamagedError, match="column 1, row 0 of level 0"):
-            store.read(around, 0.1, 0.2)
-        assert store.read((WEST, SOUTH, WEST + 20, SOUTH + 20), 0.1, 0.2) is not None
-        assert store.read(around, 0.2, 0.4) is not None  # the overviews are whole
-        if name == "dsm.tif":
-            with pytest.raises(MapDamagedError):
-                store.heights([bad])
-            assert np.isfinite(store.heights([(WEST + 10, SOUTH + 10)])).all()
+def offset_of(path, column=0, row=0, level=0):
+    with MemoryFile(path.read_bytes()) as memory, memory.open() as dataset:
+        ovr = level - 1 if level else None
+        return int(dataset.get_tag_item(f"BLOCK_OFFSET_{column}_{row}", "TIFF", bidx=1, ovr=ovr))
 
 
-def test_every_flipped_byte_is_seen(copied):
-    """Head, tile, mask, gaps: each byte of the file belongs to one segment."""
-    file = copied / "dop.tif"
-    whole = file.read_bytes()
-    pack = Pack.open(copied)
-    for at in np.linspace(0, len(whole) - 1, 40).astype(int):
-        file.write_bytes(whole)
-        flip(file, at)
-        problems = pack.verify()
-        assert problems, f"byte {at}"
-        with pytest.raises(MapError):
-            MapStore(pack)
+def assert_only_holes(opened, sound, level=0):
+    """What is shown is what the sound pack shows. Returns (invalid pixels, unknown cells) more than there."""
+    (dop, valid, dsm), (all_dop, all_valid, all_dsm) = everything(opened, level), everything(sound, level)
+    assert not (valid & ~all_valid).any()
+    assert same(dop[valid], all_dop[valid])
+    known = np.isfinite(dsm)
+    assert same(dsm[known], all_dsm[known])
+    return int((all_valid & ~valid).sum()), int((np.isfinite(all_dsm) & ~known).sum())
 
 
-def test_damaged_head_is_refused_even_when_damage_is_tolerated(copied):
-    file = copied / "dsm.tif"
-    flip(file, offset_of(file, 0, 0, level=1) - 200)
-    with pytest.raises(MapError, match=r"dsm\.tif"):
-        MapStore(Pack.open(copied), tolerate_damage=True)
+def warnings_of(caplog):
+    return [r.getMessage() for r in caplog.records if r.levelno >= logging.WARNING and r.name.startswith("ortholoc")]
 
 
-def test_swapped_file_of_another_pack_is_refused(copied, plane_pack):
-    """Same size in the manifest, another raster: the grid tells before the pixels can mislead."""
-    shutil.copy(copied / "dsm.tif", copied / "dop.tif")
-    pack = Pack(copied, plane_pack.manifest, plane_pack.georeference)
-    with pytest.raises(MapError, match="grid or its number of levels differs"):
-        MapStore(pack)
+@pytest.mark.parametrize("layer", ["dop", "dsm"])
+@pytest.mark.parametrize(
+    "fault",
+    [
+        lambda path: path.unlink(),
+        lambda path: path.write_bytes(path.read_bytes()[:-7]),
+        lambda path: path.write_bytes(b""),
+        lambda path: path.write_bytes(path.read_bytes() + b"more"),
+        lambda path: (path.unlink(), path.mkdir()),
+        lambda path: path.write_bytes(b"not a tile ".ljust(path.stat().st_size, b"!")),
+        lambda path: flip(path, offset_of(path, level=4) - 60),
+        lambda path: flip(path, 4),
+    ],
+    ids=["missing", "truncated", "empty", "longer", "folder", "wrong format", "head", "first offset"],
+)
+def test_tile_that_cannot_be_used_is_a_hole(copied, pack, sound, layer, fault, caplog):
+    tile = tile_of(pack, layer, 1, 1)
+    fault(copied / tile.file)
+    with MapStore(Pack.open(copied)) as opened:
+        assert opened.damaged == [tile.file]
+        told = warnings_of(caplog)
+        assert len(told) == 1
+        assert tile.file in told[0]
+        lost = assert_only_holes(opened, sound)
+        everywhere = everything(sound)
+        k = ("dop", "dsm").index(layer)
+        box = (DOP_BOX, DSM_BOX)[k]
+        left, upper = tile.column - box.column, tile.row - box.row
+        inside = (slice(upper, upper + tile.height), slice(left, left + tile.width))
+        expected = [everywhere[1][inside].sum(), np.isfinite(everywhere[2][inside]).sum()]
+        assert lost[k] == expected[k] > 0
+        assert lost[1 - k] == 0
+        for level in range(1, LEVELS):
+            assert_only_holes(opened, sound, level)
+        assert len(warnings_of(caplog)) == 1
+        if layer == "dsm":
+            assert np.isnan(opened.heights(DSM_GRID.map_from_px([[100.5, 200.0], [63.5, 200.0]]))).all()
+    with pytest.raises(MapError, match=rf"1 damaged or missing files.*{tile.file}.*map\.require_intact"):
+        MapStore(Pack.open(copied), require_intact=True)
 
 
-def test_sound_pack_verifies(holed_pack):
-    assert holed_pack.verify() == []
+def test_of_a_damaged_tile_only_the_bad_block_is_a_hole(copied, pack, sound, caplog):
+    """Level 1 of a tile: the other levels of the same tile are still used."""
+    for layer in ("dop", "dsm"):
+        tile = tile_of(pack, layer, 1, 1)
+        flip(copied / tile.file, offset_of(copied / tile.file, level=1) + 40)
+    with MapStore(Pack.open(copied)) as opened:
+        assert len(opened.damaged) == 2
+        assert [("1 blocks are holes" in text) for text in warnings_of(caplog)] == [True, True]
+        for level in range(LEVELS):
+            lost = assert_only_holes(opened, sound, level)
+            assert (lost[0] > 0, lost[1] > 0) == (level == 1, level == 1)
 
 
-def test_undecodable_tile_is_named(holed_pack):
-    """A tile that passes its checksum and still does not decode: the encoder's fault, seen by the build."""
-    data = bytearray((holed_pack.path / "dsm.tif").read_bytes())
-    at = offset_of(holed_pack.path / "dsm.tif", 1, 1)
-    data[at : at + 64] = bytes(64)
-    with Cog(bytes(data), holed_pack.path / "dsm.tif") as cog:
-        assert cog.undecodable() == [Block(0, 1, 1)]
+def test_missing_files_give_one_line_and_a_count(copied, pack, caplog):
+    for tile in pack.manifest.dop.tiles[:5]:
+        (copied / tile.file).unlink()
+    found = Pack.open(copied)
+    assert found.missing == {tile.file for tile in pack.manifest.dop.tiles[:5]}
+    with MapStore(found) as opened:
+        assert opened.damaged == [tile.file for tile in pack.manifest.dop.tiles[:5]]
+    (told,) = warnings_of(caplog)
+    assert "5 of its 12 files" in told
+    assert pack.manifest.dop.tiles[0].file in told
+
+
+def test_pack_without_any_usable_surface_is_refused(copied):
+    for path in (copied / "dsm").iterdir():
+        flip(path, 4)
+    with pytest.raises(MapError, match=r"none of the 6 tiles of the DSM.*copy the pack again"):
+        MapStore(Pack.open(copied))
+
+
+def test_file_that_vanishes_after_the_look(copied, pack, caplog):
+    found = Pack.open(copied)
+    tile = tile_of(pack, "dsm", 0, 0)
+    (copied / tile.file).unlink()
+    with MapStore(found) as opened:
+        assert opened.damaged == [tile.file]
+    assert tile.file in caplog.text
+
+
+def replaced(folder, layer, index, data):
+    """Put a file in place of a tile and let the manifest say that it belongs there."""
+    found = Pack.open(folder)
+    described = getattr(found.manifest, layer)
+    tile = described.tiles[index]
+    (folder / tile.file).write_bytes(data)
+    tiles = list(described.tiles)
+    tiles[index] = msgspec.structs.replace(tile, bytes=len(data), sha256=hashlib.sha256(data).hexdigest())
+    write_manifest(
+        msgspec.structs.replace(found.manifest, **{layer: msgspec.structs.replace(described, tiles=tiles)}),
+        folder / MANIFEST_NAME,
+    )
+    return tile.file
+
+
+@pytest.mark.parametrize("layer", ["dop", "dsm"])
+def test_file_that_the_manifest_calls_right_and_is_not(copied, pack, sound, layer, caplog):
+    """Another tile, the other layer, no picture, nothing: seen when it is first looked at, told once."""
+    described = getattr(pack.manifest, layer)
+    other = (copied / getattr(pack.manifest, "dsm" if layer == "dop" else "dop").tiles[4].file).read_bytes()
+    for data in ((copied / described.tiles[0].file).read_bytes(), other, b"no picture", b""):
+        caplog.clear()
+        name = replaced(copied, layer, 4, data)
+        with MapStore(Pack.open(copied)) as opened:
+            assert opened.damaged == []
+            assert sum(assert_only_holes(opened, sound)) > 0
+            assert_only_holes(opened, sound)
+            assert opened.damaged == [name]
+            assert [name in text for text in warnings_of(caplog)] == [True]
+
+
+@pytest.mark.parametrize("layer", ["dop", "dsm"])
+def test_block_that_does_not_decode_is_a_hole(copied, pack, sound, layer, caplog):
+    """The encoder's fault: the hash is right. Other levels of the tile stay, and readers of several blocks too."""
+    path = copied / getattr(pack.manifest, layer).tiles[4].file
+    data = bytearray(path.read_bytes())
+    at = offset_of(path, level=0)
+    data[at : at + 200] = bytes(200)
+    name = replaced(copied, layer, 4, bytes(data))
+    with MapStore(Pack.open(copied)) as opened:
+        lost = assert_only_holes(opened, sound)
+        assert lost[("dop", "dsm").index(layer)] > 0
+        assert assert_only_holes(opened, sound) == lost
+        assert assert_only_holes(opened, sound, 2) == (0, 0)
+        assert opened.damaged == [name]
+        assert [name in text for text in warnings_of(caplog)] == [True]
+
+
+def test_several_bad_blocks_in_a_large_tile(tmp_path, caplog):
+    """A tile of 2 x 2 blocks, two of which do not decode: the other two are read one by one."""
+    rng = np.random.default_rng(2)
+    rgb = pixels(1024, 1024)
+    heights = rng.uniform(0, 9, (256, 256)).astype(np.float32)
+    lattice = msgspec.structs.replace(packs.DOP_LATTICE, tile_px=1024)
+    pack = packs.write_pack(tmp_path, rgb, heights, dop_lattice=lattice, dop_corner=(0, 0), dsm_corner=(0, 0))
+    path = tmp_path / pack.manifest.dop.tiles[0].file
+    data = bytearray(path.read_bytes())
+    for column, row in ((0, 0), (1, 1)):
+        at = offset_of(path, column, row)
+        data[at : at + 200] = bytes(200)
+    replaced(tmp_path, "dop", 0, bytes(data))
+    expected = np.ones((1024, 1024), dtype=bool)
+    expected[:512, :512] = expected[512:, 512:] = False
+    with MapStore(Pack.open(tmp_path)) as opened:
+        for _ in range(2):
+            dop, valid, _ = everything(opened)
+            assert same(valid, expected)
+            assert same(dop[valid], np.moveaxis(rgb, 0, -1)[valid])
+        assert len(warnings_of(caplog)) == 1
+    flipped = shutil.copytree(tmp_path, tmp_path.with_name("flipped"))
+    problems = Pack.open(flipped).verify()
+    assert sum("cannot be decoded" in problem for problem in problems) == 2
+    assert any("block at column 1, row 1 of level 0" in problem for problem in problems)
+
+
+# -- features ------------------------------------------------------------------------------------------
+
+
+def with_features(folder, pack, contents, dop_sha256=None):
+    tiles = []
+    for index, data in contents.items():
+        dop = pack.manifest.dop.tiles[index]
+        name = dop.file.replace("dop/", "features/").replace(".tif", ".npy")
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(data)
+        tiles.append(
+            FeatureTile(
+                file=name, bytes=len(data), sha256=hashlib.sha256(data).hexdigest(), dop=index,
+                dop_sha256=dop_sha256 or dop.sha256, counts=(1, 0, 0, 0, 0),
+            )
+        )  # fmt: skip
+    layer = FeatureLayer(matcher="sift", model_sha256="0" * 64, encoding="test", per_mpx=10.0, tiles=tiles)
+    write_manifest(msgspec.structs.replace(pack.manifest, features=layer), folder / MANIFEST_NAME)
+    return Pack.open(folder), [tile.file for tile in tiles]
+
+
+def test_feature_files_are_held_where_asked_for(copied, pack, caplog):
+    found, names = with_features(copied, pack, {0: b"first", 3: b"fourth"})
+    assert found.verify() == []
+    with MapStore(found) as without, MapStore(found, features=True) as opened:
+        assert without.feature_bytes(0) is None
+        assert [opened.feature_bytes(k) for k in range(4)] == [b"first", None, None, b"fourth"]
+        assert opened.compressed_bytes == without.compressed_bytes + 11
+    flip(copied / names[0], 1)
+    (copied / names[1]).unlink()
+    with MapStore(Pack.open(copied), features=True) as opened:
+        assert [opened.feature_bytes(k) for k in (0, 3)] == [None, None]
+        assert opened.damaged == names
+    assert names[0] in caplog.text
+
+
+def test_features_of_another_orthophoto_are_refused(copied, pack, caplog):
+    found, names = with_features(copied, pack, {2: b"of another flight"}, dop_sha256="1" * 64)
+    with MapStore(found, features=True) as opened:
+        assert opened.feature_bytes(2) is None
+    assert "features of another orthophoto" in caplog.text
+    assert any(names[0] in problem for problem in found.verify())
