@@ -4,9 +4,10 @@ import sys
 import textwrap
 
 import numpy as np
+import packs
 import pyproj
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from tile_rasters import SHARED
 
@@ -16,9 +17,11 @@ from ortholoc_edge.geometry.frames import ecef_from_geodetic, map_from_ned_rotat
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.tiles.georeference import (
     Georeference,
+    HeightOffsets,
     LocalFrame,
     VerticalDatum,
     datum_shift_caveat,
+    derive_offsets,
     derive_vertical,
 )
 
@@ -213,20 +216,28 @@ def test_stated_undulation_moves_heights_the_right_way():
     assert orthometric.ellipsoid_from_map(453.0) == 500.0
 
 
-def test_missing_geoid_grid_is_no_silent_zero():
-    """PROJ leaves heights alone where the grid is missing; the offset must be unknown then, not 0."""
-    assert derive_vertical("ellipsoid", None, None, (48.0, 10.0)).amsl_minus_map_m is None
+def test_missing_geoid_grid_is_no_silent_zero(caplog):
+    """PROJ leaves heights alone where the grid is missing; that must be refused then, or said, and not be 0."""
+    for place in ((48.0, 10.0), None):
+        with pytest.raises(
+            ConfigError, match=r"--geoid-undulation-m METRES.*us_nga_egm96_15\.tif.*PROJ_DATA.*projsync"
+        ):
+            derive_vertical("ellipsoid", None, None, place)
     national = derive_vertical("orthometric", 7837, None, (48.0, 10.0))
     assert national.ellipsoid_minus_map_m is None
     assert national.amsl_minus_map_m == 0.0
     assert "about 1 m" in national.derivation
+    assert "DHHN2016 height: PROJ has no geoid grid" in caplog.text
+    assert "good to 1 m" in caplog.text
+    caplog.clear()
+    derive_vertical("orthometric", 5773, None, (48.0, 10.0))
+    assert caplog.text == ""  # EGM96's own heights are exact
 
 
 @pytest.mark.parametrize(
     ("kind", "epsg", "undulation_m", "sigma_m"),
     [
         ("ellipsoid", None, 47.0, 0.0),
-        ("ellipsoid", None, None, None),
         ("orthometric", 5773, None, 0.0),
         ("orthometric", None, None, 1.0),
         ("orthometric", 7837, 47.0, 1.0),  # the stated undulation says nothing of its zero against EGM96's
@@ -264,11 +275,12 @@ def test_geoid_grid_is_used_where_proj_has_it(tmp_path):
     import numpy as np, pyproj.datadir, rasterio
     from affine import Affine
     from ortholoc_edge.errors import ConfigError
-    from ortholoc_edge.tiles.georeference import derive_vertical
+    from ortholoc_edge.tiles.georeference import derive_offsets, derive_vertical
     profile = dict(driver="GTiff", width=13, height=13, count=1, dtype="float32", crs="EPSG:4326",
                    transform=Affine(.25, 0, 8.375, 0, -.25, 49.625))
     with rasterio.open(r"{tmp_path}/us_nga_egm96_15.tif", "w", **profile) as grid:
-        grid.write(np.full((13, 13), 47.5, "float32"), 1)
+        # Rises eastward by 0.4 m per cell; 47.5 m at 10 degrees east.
+        grid.write(np.tile(47.5 + 0.4 * (np.arange(13) - 6), (13, 1)).astype("float32"), 1)
         grid.update_tags(TYPE="VERTICAL_OFFSET_GEOGRAPHIC_TO_VERTICAL", AREA_OR_POINT="Point")
         grid.set_band_description(1, "geoid_undulation")
         grid.update_tags(1, positive_value="up", target_crs_epsg_code="5773")
@@ -278,8 +290,20 @@ def test_geoid_grid_is_used_where_proj_has_it(tmp_path):
     egm96 = derive_vertical("orthometric", 5773, None, (48.2, 10.0))
     assert egm96.amsl_sigma_m == 0.0, egm96
     assert abs(egm96.ellipsoid_minus_map_m - 47.5) < 1e-3 and abs(egm96.amsl_minus_map_m) < 1e-3, egm96
-    outside = derive_vertical("ellipsoid", None, None, (20.0, 10.0))
-    assert outside.amsl_minus_map_m is None, outside
+    places = [(48.2, 10.0), (48.2, 10.25), (48.4, 9.5)]
+    datum, amsl, ellipsoid = derive_offsets("ellipsoid", None, None, places)
+    assert abs(datum.amsl_minus_map_m + 47.5) < 1e-3, datum
+    assert np.allclose(amsl, [-47.5, -47.9, -46.7], atol=1e-3) and (ellipsoid == 0).all(), amsl
+    datum, amsl, ellipsoid = derive_offsets("orthometric", 5773, None, places)
+    assert np.allclose(ellipsoid, [47.5, 47.9, 46.7], atol=1e-3) and np.allclose(amsl, 0, atol=1e-3), ellipsoid
+    # A geoid that covers the area in part would give it a step.
+    for out_of_grid in ([(20.0, 10.0)], [(48.2, 10.0), (20.0, 10.0)]):
+        try:
+            derive_offsets("ellipsoid", None, None, out_of_grid)
+        except ConfigError as err:
+            assert "--geoid-undulation-m" in str(err)
+        else:
+            raise AssertionError("an unknown geoid passed")
     try:
         derive_vertical("ellipsoid", None, -47.5, (48.2, 10.0))
     except ConfigError as err:
@@ -295,6 +319,103 @@ def test_geoid_grid_is_used_where_proj_has_it(tmp_path):
         check=False,
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_stated_undulation_holds_everywhere():
+    places = [(48.0, 10.0), (48.5, 10.5)]
+    datum, amsl, ellipsoid = derive_offsets("ellipsoid", None, 47.0, places)
+    assert (datum.amsl_minus_map_m, datum.ellipsoid_minus_map_m) == (-47.0, 0.0)
+    assert (amsl.tolist(), ellipsoid.tolist()) == ([-47.0, -47.0], [0.0, 0.0])
+    datum, amsl, ellipsoid = derive_offsets("orthometric", 5773, 47.0, places)
+    assert (amsl.tolist(), ellipsoid.tolist()) == ([0.0, 0.0], [47.0, 47.0])
+    assert derive_offsets("orthometric", 5773, None, places)[2] is None
+    assert derive_offsets("orthometric", 5773, 47.0, None)[1:] == (None, None)
+    assert derive_offsets("unknown", None, None, places)[1:] == (None, None)
+
+
+# -- offsets by place ----------------------------------------------------------------------------------
+
+SIDE_M = 800.0
+
+
+def offsets_of(amsl, ellipsoid=None):
+    return HeightOffsets(400_000.0, 5_400_000.0, SIDE_M, amsl, ellipsoid or {})
+
+
+def slope(column, row):
+    return -47.0 + 0.03 * column - 0.02 * row
+
+
+def test_offsets_are_bilinear_between_the_centres_of_tiles():
+    offsets = offsets_of({(c, r): slope(c, r) for c in range(5) for r in range(4)})
+    rng = np.random.default_rng(0)
+    for column, row in rng.uniform((0, 0), (4, 3), (50, 2)):
+        x, y = 400_000.0 + (column + 0.5) * SIDE_M, 5_400_000.0 - (row + 0.5) * SIDE_M
+        assert offsets.amsl_minus_map_m(x, y) == pytest.approx(slope(column, row), abs=1e-9)
+        assert offsets.ellipsoid_minus_map_m(x, y) is None
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    start=st.tuples(st.floats(-0.9, 5.9), st.floats(-0.9, 5.9)),
+    heading=st.floats(0, 6.28),
+    keys=st.sets(st.tuples(st.integers(0, 4), st.integers(0, 4)), min_size=1),
+)
+def test_offsets_have_no_steps_over_the_tiles(start, heading, keys):
+    """Along any line, as long as it is over a tile: with holes in the pack, and at its rim."""
+    offsets = offsets_of({key: float(np.sin(3.0 * key[0] + 7.0 * key[1])) for key in keys})
+    along = np.arange(0.0, 3.0, 1e-3)
+    columns, rows = start[0] + along * np.cos(heading), start[1] + along * np.sin(heading)
+    over = np.array([(int(np.floor(c)), int(np.floor(r))) in keys for c, r in zip(columns, rows, strict=True)])
+    values = np.array(
+        [
+            offsets.amsl_minus_map_m(400_000.0 + c * SIDE_M, 5_400_000.0 - r * SIDE_M)
+            for c, r in zip(columns, rows, strict=True)
+        ]
+    )
+    assert ((values >= -1.0) & (values <= 1.0)).all()
+    steps = np.abs(np.diff(values))[over[1:] & over[:-1]]
+    # 0.8 m of way between offsets that differ by 2 m over 800 m, by a quarter of the weight at worst.
+    assert steps.max(initial=0.0) < 0.02
+
+
+def test_beyond_all_tiles_the_nearest_counts():
+    offsets = offsets_of({(0, 0): 1.0, (3, 0): 4.0})
+    assert offsets.amsl_minus_map_m(400_000.0 - 50_000.0, 5_400_000.0) == 1.0
+    assert offsets.amsl_minus_map_m(400_000.0 + 50_000.0, 5_500_000.0) == 4.0
+    assert offsets.amsl_minus_map_m(400_000.0 + 1.4 * SIDE_M, 5_300_000.0) == 1.0
+
+
+def test_heights_use_the_offset_of_the_place():
+    x, y = 400_000.0 + 0.5 * SIDE_M, 5_400_000.0 - 0.5 * SIDE_M
+    offsets = offsets_of({(0, 0): -47.0, (1, 0): -48.0}, {(0, 0): 0.25, (1, 0): 0.25})
+    reference = Georeference("EPSG:32633", ELLIPSOIDAL, (x, y), offsets)
+    for east, offset in ((0.0, -47.0), (SIDE_M, -48.0), (SIDE_M / 2, -47.5), (9e4, -48.0)):
+        place = reference.geodetic_from_map((x + east, y, 500.0))
+        assert place.height_amsl_m == pytest.approx(500.0 + offset)
+        assert place.height_ellipsoid_m == pytest.approx(500.25)
+        for heights in ({"height_amsl_m": place.height_amsl_m}, {"height_ellipsoid_m": place.height_ellipsoid_m}):
+            back = reference.map_from_geodetic(place.lat_deg, place.lon_deg, **heights)
+            assert np.allclose(back, (x + east, y, 500.0), rtol=0, atol=1e-5)
+    # Where no tile says anything, what holds for the pack as a whole does.
+    plain = Georeference("EPSG:32633", ELLIPSOIDAL, (x, y), offsets_of({}))
+    assert plain.geodetic_from_map((x, y, 500.0)).height_amsl_m == 500.0 - 47.5
+    assert plain.amsl_minus_map_m((x, y)) == -47.5
+
+
+def test_a_pack_carries_its_offsets(tmp_path):
+    """Through the manifest: the tile's own, and between two tiles the mean."""
+    rgb, heights = np.zeros((3, 512, 512), dtype=np.uint8), np.zeros((128, 256), dtype=np.float32)
+    by_tile = {(0, 0): (-0.5, 46.0), (1, 0): (-0.25, 47.0)}
+    pack = packs.write_pack(
+        tmp_path, rgb, heights, dop_corner=(0, 0), dsm_corner=(0, 0), offsets=by_tile,
+        vertical=VerticalDatum(kind="orthometric", amsl_minus_map_m=9.0),
+    )  # fmt: skip
+    reference = pack.georeference
+    first, second = (400_064.0, 5_299_936.0), (400_192.0, 5_299_936.0)
+    assert [reference.amsl_minus_map_m(at) for at in (first, second)] == [-0.5, -0.25]
+    assert reference.ellipsoid_minus_map_m((400_128.0, 5_299_930.0)) == 46.5
+    assert reference.geodetic_from_map((*first, 100.0)).height_amsl_m == 99.5
 
 
 def test_missing_datum_grid_is_told():
