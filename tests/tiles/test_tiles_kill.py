@@ -1,0 +1,12 @@
+import sys
+
+import pytest
+from kill_loop import kill_loop
+
+pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs /proc and renameat2")
+
+
+@pytest.mark.parametrize("two_steps", [False, True])
+def test_killed_build_leaves_the_old_pack_or_the_new(tmp_path, two_steps):
+    seen = kill_loop(tmp_path, 5, seed=3, two_steps=two_steps)
+    assert seen["group killed"] + seen["parent killed"] == 5
