@@ -106,7 +106,8 @@ class Sampler:
         per_pixel = []
         for values, valid in samples:
             small = _shrunk(values.astype(np.float32), factor)
-            grid = RasterGrid(small.shape[2], small.shape[1], 0.0, 0.0, gsd_m, -gsd_m)
+            # Not at 0, 0, which with pixels of 1 m would be no georeference.
+            grid = RasterGrid(small.shape[2], small.shape[1], gsd_m, gsd_m, gsd_m, -gsd_m)
             if values.dtype == np.uint8:
                 there = _shrunk(valid[None].astype(np.float32), factor)[0] >= 0.5
                 picture = np.rint(small).astype(np.uint8)
