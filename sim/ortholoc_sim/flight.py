@@ -40,6 +40,7 @@ from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
 from ortholoc_edge.pipeline.navigator import TimingOptions
 from ortholoc_edge.pipeline.outcome import Fix, Outcome
+from ortholoc_edge.tiles.lattice import CROP_PX
 from ortholoc_edge.tiles.manifest import layer_bounds
 from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.store import MapStore
@@ -48,6 +49,7 @@ from ortholoc_sim.autopilot import AutopilotOptions, UdpPort, Verdict
 from ortholoc_sim.camera import Placement, Renderer, Sensor
 from ortholoc_sim.epoch import FLIGHT, Epoch
 from ortholoc_sim.loop import STEP_NS, ClosedLoop, LoopOptions
+from ortholoc_sim.make_demo_pack import DEMO_SOUTH_M, DEMO_WEST_M
 from ortholoc_sim.site import Site
 from ortholoc_sim.vehicle import VehicleOptions
 from ortholoc_sim.world import WorldSpec, build_scene, generate
@@ -73,7 +75,7 @@ class FlightOptions:
     """One flight over a pack that was made of the generated world ``spec``.
 
     Attributes:
-        route_m: waypoints (east, north) in m from the pack's south-west corner.
+        route_m: waypoints (east, north) in m from the world's south-west corner.
         height_agl_m: above the typical ground of the pack; the flight begins 20 m lower.
         duration_s, gnss_until_s: of the flight, from its start.
         frame_rate_hz: of the camera.
@@ -444,8 +446,7 @@ def _fly(
 
 def _site_and_route(pack: Pack, options: FlightOptions) -> tuple[Site, FloatArray]:
     with MapStore(pack) as store:
-        west, south, _, _ = store.bounds
-        xy = np.array(options.route_m, dtype=np.float64) + np.array([west, south])
+        xy = np.array(options.route_m, dtype=np.float64) + np.array([DEMO_WEST_M, DEMO_SOUTH_M])
         # Trees and roofs lift the mean, not the median.
         ground = store.heights(_along(xy, 10.0))
     if not np.isfinite(ground).any():
@@ -466,12 +467,21 @@ def _along(points: FloatArray, step_m: float) -> FloatArray:
 
 def _placement(pack: Pack, site: Site, spec: WorldSpec) -> Placement:
     west, south, east, north = layer_bounds(pack.manifest.dop)
-    if abs(east - west - spec.width_m) > 1.0 or abs(north - south - spec.height_m) > 1.0:
+    # A pack's rim lies on whole steps of its tiles.
+    step_m = CROP_PX * pack.manifest.dop.gsd_m
+    over = (
+        DEMO_WEST_M - west,
+        DEMO_SOUTH_M - south,
+        east - (DEMO_WEST_M + spec.width_m),
+        north - (DEMO_SOUTH_M + spec.height_m),
+    )
+    if not all(-1.0 < margin < step_m for margin in over):
         raise MapError(
-            f"area pack {pack.path}: {east - west:.0f} x {north - south:.0f} m, the generated world has "
-            f"{spec.width_m:.0f} x {spec.height_m:.0f} m; make it with python -m ortholoc_sim.make_demo_pack"
+            f"area pack {pack.path}: {east - west:.0f} x {north - south:.0f} m from ({west:.0f}, {south:.0f}), the "
+            f"generated world has {spec.width_m:.0f} x {spec.height_m:.0f} m from ({DEMO_WEST_M:.0f}, "
+            f"{DEMO_SOUTH_M:.0f}); make its pack with python -m ortholoc_sim.make_demo_pack"
         )
-    return Placement(west, south, site.grid_scale)
+    return Placement(DEMO_WEST_M, DEMO_SOUTH_M, site.grid_scale)
 
 
 # -- what it came to ---------------------------------------------------------

@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import json
 import shutil
+import socket
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import rasterio
@@ -235,49 +238,78 @@ def test_nan_attitude_on_the_command_line(flight: Path, intrinsics: Path, capsys
 # -- the pack ----------------------------------------------------------------
 
 
-@pytest.fixture
-def damaged(tmp_path: Path) -> Path:
-    """The demo pack with 200 bytes flipped in the middle of its orthophoto."""
-    path = shutil.copytree(rendered.store().pack.path, tmp_path / "pack")
-    data = bytearray((path / "dop.tif").read_bytes())
+def damage(path: Path) -> None:
+    """Flip 200 bytes in the middle of a tile."""
+    data = bytearray(path.read_bytes())
     for at in range(len(data) // 2, len(data) // 2 + 200):
         data[at] ^= 0xFF
-    (path / "dop.tif").write_bytes(data)
-    return path
+    path.write_bytes(data)
 
 
-def test_corrupt_tile_is_refused_with_the_file(damaged: Path) -> None:
-    with pytest.raises(MapError, match=r"dop\.tif.*(rebuild|copy)"):
-        MapStore(Pack.open(damaged))
-    assert any("dop.tif" in problem for problem in Pack.open(damaged).verify())
+def tile_under(pack: Pack, kind: str, at: Rigid3) -> str:
+    layer = getattr(pack.manifest, kind)
+    for tile in layer.tiles:
+        west, south, east, north = layer.lattice.grid(tile.box).bounds
+        if west <= at.translation[0] < east and south <= at.translation[1] < north:
+            return str(tile.file)
+    raise AssertionError(f"no tile of the {kind} under {at.translation}")
 
 
-def test_corrupt_tile_that_is_tolerated(damaged: Path, localizer_of: Callable[..., Localizer]) -> None:
-    with MapStore(Pack.open(damaged), tolerate_damage=True) as store:
-        bad, good = [], []
-        for east in range(60, 580, 40):
-            for north in range(60, 460, 40):
-                at = rendered.pose(float(east), float(north))
-                x, y = at.translation[:2]
-                try:
-                    for gsd_m in (0.25, 0.5):
-                        store.read((x - 100, y - 100, x + 100, y + 100), gsd_m)
-                except MapError:
-                    try:
-                        store.read((x - 10, y - 10, x + 10, y + 10), 0.25)
-                    except MapError:
-                        bad.append(at)
-                else:
-                    good.append(at)
-        assert bad
+@pytest.fixture
+def copied(tmp_path: Path) -> Path:
+    return shutil.copytree(rendered.store().pack.path, tmp_path / "pack")
+
+
+@pytest.fixture
+def damaged(copied: Path) -> Path:
+    """The demo pack with a damaged block in one tile of its orthophoto."""
+    damage(copied / tile_under(rendered.store().pack, "dop", PLACES[0]))
+    return copied
+
+
+def holes(store: MapStore, at: Rigid3, reach_m: float) -> float:
+    """Share of the orthophoto around a place that only the sound pack has, at the scales of a flight."""
+    x, y = at.translation[:2]
+    lost = []
+    for gsd_m in (0.25, 0.5):
+        there, here = (
+            one.read((x - reach_m, y - reach_m, x + reach_m, y + reach_m), gsd_m) for one in (rendered.store(), store)
+        )
+        assert there is not None
+        assert here is not None
+        lost.append(float((there.dop_valid & ~here.dop_valid).mean()))
+    return max(lost)
+
+
+def test_corrupt_tile_is_flown_around(damaged: Path, localizer_of: Callable[..., Localizer]) -> None:
+    """Over the hole no wrong fix, beside it the right ones."""
+    name = tile_under(rendered.store().pack, "dop", PLACES[0])
+    assert any(name in problem for problem in Pack.open(damaged).verify())
+    with MapStore(Pack.open(damaged)) as store:
+        assert store.damaged == [name]
+        places = [rendered.pose(float(e), float(n)) for e in range(60, 580, 40) for n in range(60, 460, 40)]
+        bad = max(places, key=lambda at: holes(store, at, 40.0))
+        good = [at for at in places if holes(store, at, 100.0) == 0.0]
+        assert holes(store, bad, 40.0) > 0.5
         assert good
         localizer = localizer_of(store)
-        over = localizer.localize(rendered.frame(bad[0]), rendered.prior(bad[0]))
-        assert isinstance(over, Rejected)
-        assert over.reason in (Reason.MAP_DAMAGED, Reason.MAP_NODATA)
-        assert "dop.tif" in over.detail
+        assert not is_wrong(localizer.localize(rendered.frame(bad), rendered.prior(bad)), bad)
         elsewhere = good[len(good) // 2]
         assert is_right(localizer.localize(rendered.frame(elsewhere), rendered.prior(elsewhere)), elsewhere)
+
+
+@pytest.mark.parametrize("kind", ["dop", "dsm"])
+def test_missing_tile_gives_no_fix_over_it(copied: Path, kind: str, localizer_of: Callable[..., Localizer]) -> None:
+    pack = rendered.store().pack
+    (copied / tile_under(pack, kind, PLACES[1])).unlink()
+    far = rendered.pose(500.0, 250.0)
+    assert tile_under(pack, kind, far) != tile_under(pack, kind, PLACES[1])
+    with MapStore(Pack.open(copied)) as store:
+        localizer = localizer_of(store)
+        over = localizer.localize(rendered.frame(PLACES[1]), rendered.prior(PLACES[1]))
+        assert isinstance(over, Rejected)
+        assert over.reason in (Reason.MAP_NODATA, Reason.OUTSIDE_MAP)
+        assert is_right(localizer.localize(rendered.frame(far), rendered.prior(far)), far)
 
 
 def write_rasters(folder: Path, crs: str | None, hole_m: tuple[float, float, float, float] | None = None):
@@ -312,7 +344,7 @@ def test_missing_surface_under_the_view(tmp_path: Path, localizer_of: Callable[.
     truth = rendered.pose()
     # Wider than the view by more than the search: around it there are heights, below it none.
     sources = write_rasters(tmp_path / "holed", "EPSG:32632", (-105.0, -105.0, 105.0, 105.0))
-    with MapStore(build_pack(*sources, tmp_path / "pack", PackOptions())) as store:
+    with MapStore(build_pack(*sources, tmp_path / "pack", PackOptions(vertical="unknown"))) as store:
         outcome = localizer_of(store).localize(rendered.frame(truth), rendered.prior(truth))
     assert isinstance(outcome, Rejected)
     assert outcome.reason in (Reason.MAP_NODATA, Reason.OUTSIDE_MAP)
@@ -322,7 +354,7 @@ def test_half_a_surface_is_enough_or_nothing(tmp_path: Path, localizer_of: Calla
     """Half the view without heights: its matches are dropped, and what is left must not bend the pose."""
     truth = rendered.pose()
     sources = write_rasters(tmp_path / "holed", "EPSG:32632", (0.0, -200.0, 200.0, 200.0))
-    with MapStore(build_pack(*sources, tmp_path / "pack", PackOptions())) as store:
+    with MapStore(build_pack(*sources, tmp_path / "pack", PackOptions(vertical="unknown"))) as store:
         outcome = localizer_of(store).localize(rendered.frame(truth), rendered.prior(truth))
     assert not is_wrong(outcome, truth)
     if isinstance(outcome, Fix):
@@ -345,11 +377,10 @@ def config(pack: Path, folder: Path) -> Config:
 @pytest.mark.parametrize(
     ("crs", "options", "remedy"),
     [
-        (None, PackOptions(), "projected"),
+        (None, PackOptions(vertical="unknown"), "projected"),
         ("EPSG:32632", PackOptions(vertical="unknown"), "--vertical"),
-        ("EPSG:32632", PackOptions(vertical="ellipsoid"), "--geoid-undulation-m"),
     ],
-    ids=["no CRS", "no datum", "no geoid"],
+    ids=["no CRS", "no datum"],
 )
 def test_pack_that_cannot_be_flown(crs: str | None, options: PackOptions, remedy: str, tmp_path: Path) -> None:
     sources = write_rasters(tmp_path / "sources", crs)
@@ -360,9 +391,25 @@ def test_pack_that_cannot_be_flown(crs: str | None, options: PackOptions, remedy
     assert str(pack.path) in str(refused.value)
 
 
-def test_corrupt_pack_keeps_the_daemon_on_the_ground(damaged: Path, tmp_path: Path) -> None:
-    with pytest.raises(MapError, match=r"dop\.tif"):
-        Daemon(config(damaged, tmp_path))
+def test_corrupt_pack_keeps_the_daemon_on_the_ground_if_told_so(damaged: Path, tmp_path: Path) -> None:
+    rendered.write_picture(tmp_path / "frames" / "a.jpg", rendered.picture(PLACES[0]))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("127.0.0.1", 0))
+        link = LinkOptions(endpoint=f"udp:127.0.0.1:{one.getsockname()[1]}")
+    asked = msgspec.structs.replace(config(damaged, tmp_path / "frames"), link=link)
+    daemon = Daemon(asked)
+    assert daemon.statistics()["map_files_damaged"] == 1
+    stop = threading.Event()
+    stop.set()
+    daemon.run(stop)
+    with pytest.raises(MapError, match=r"1 damaged or missing files, the first dop/.*require_intact"):
+        Daemon(msgspec.structs.replace(asked, map=MapOptions(pack=str(damaged), require_intact=True)))
+
+
+def test_pack_over_the_memory_budget_keeps_the_daemon_on_the_ground(tmp_path: Path) -> None:
+    asked = config(rendered.store().pack.path, tmp_path)
+    with pytest.raises(MapError, match=r"map\.memory_mb"):
+        Daemon(msgspec.structs.replace(asked, map=MapOptions(pack=asked.map.pack, memory_mb=1)))
 
 
 # -- the model ---------------------------------------------------------------
