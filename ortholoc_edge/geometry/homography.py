@@ -21,13 +21,3 @@ def positive_at(homography: FloatArray, px: npt.ArrayLike) -> FloatArray:
     """The homography with its sign chosen so that the third coordinate is positive at ``px`` (2,)."""
     w = float(homography[2] @ np.append(np.asarray(px, dtype=np.float64), 1.0))
     return -homography if w < 0 else homography
-
-
-def local_scale(homography: npt.ArrayLike, px: npt.ArrayLike) -> float:
-    """Length that a step of one pixel at ``px`` (2,) gets, averaged over directions; the square root of the
-    area factor. NaN beyond the horizon."""
-    u, v = np.asarray(px, dtype=np.float64)
-    ahead = warp_points(homography, [[u, v], [u + 0.5, v], [u, v + 0.5]])
-    # By hand: numpy's determinant warns about NaN.
-    (a, b), (c, d) = (ahead[1:] - ahead[0]) * 2.0
-    return float(np.sqrt(abs(a * d - b * c)))

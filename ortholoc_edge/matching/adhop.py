@@ -1,4 +1,4 @@
-"""Pieces of the paper's AdHoP and of its four rotations, as pure functions.
+"""The homography of the paper's AdHoP, as a pure function.
 
 OrthoLoC, section "AdHoP Refinement": a homography from the 2D-2D matches by normalised DLT and RANSAC, the
 orthophoto warped with it, matched again, matches taken back by its inverse. The loop is `pipeline`'s.
@@ -6,7 +6,7 @@ orthophoto warped with it, matched again, matches taken back by its inverse. The
 
 from __future__ import annotations
 
-from typing import Final, TypeVar
+from typing import Final
 
 import cv2
 import numpy as np
@@ -29,8 +29,6 @@ MIN_SPREAD: Final = 2.0
 # RANSAC: 0.999 and 5000 draws suffice down to about one right pair in five (log 0.001 / log(1 - 0.2^4) = 4314).
 _CONFIDENCE: Final = 0.999
 _MAX_DRAWS: Final = 5000
-
-_Pixel = TypeVar("_Pixel", bound=np.generic)
 
 
 def fit_homography(
@@ -124,22 +122,3 @@ def _normaliser(points: FloatArray) -> FloatArray:
     centre = points.mean(axis=0)
     scale = np.sqrt(2.0) / np.linalg.norm(points - centre, axis=1).mean()
     return np.array([[scale, 0.0, -scale * centre[0]], [0.0, scale, -scale * centre[1]], [0.0, 0.0, 1.0]])
-
-
-def rotate_quarter(image: npt.NDArray[_Pixel], k: int) -> npt.NDArray[_Pixel]:
-    """``image`` (H, W, ...) turned counter-clockwise by ``k`` quarter turns, contiguous."""
-    return np.ascontiguousarray(np.rot90(image, k % 4))
-
-
-def unrotate_px(px: npt.ArrayLike, k: int, shape: tuple[int, ...]) -> FloatArray:
-    """Pixels (..., 2) of ``rotate_quarter(image, k)`` in the pixels of ``image``; exact.
-
-    Args:
-        px: (u, v), centres at integers.
-        k: as given to :func:`rotate_quarter`.
-        shape: of the image before it was turned, (H, W, ...).
-    """
-    u, v = np.moveaxis(np.asarray(px, dtype=np.float64), -1, 0)
-    last_u, last_v = shape[1] - 1, shape[0] - 1
-    turned = ((u, v), (last_u - v, u), (last_u - u, last_v - v), (v, last_v - u))[k % 4]
-    return np.stack(turned, axis=-1)

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
-from msgspec import Meta, Struct, field
+from msgspec import Meta, Struct, field, structs
 
+from ortholoc_edge.errors import MapError
 from ortholoc_edge.geometry import homography
 from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.grid import resize_px
 from ortholoc_edge.matching.adhop import fit_homography
-from ortholoc_edge.matching.types import Features, Matcher, Matches
+from ortholoc_edge.matching.types import Features, Matcher, Matches, UnscaledMatcher
 from ortholoc_edge.pipeline import gate, precondition
 from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
@@ -32,23 +34,28 @@ from ortholoc_edge.pipeline.prior import (
     hypotheses,
     search_bounds,
 )
+from ortholoc_edge.pipeline.rounds import RejectedError, Round, Scene
+from ortholoc_edge.pipeline.stored import Attempt, StoredMatching
 from ortholoc_edge.pipeline.trace import Trace
 from ortholoc_edge.pose import calibrate, pnp
 from ortholoc_edge.pose.lift import lift
+from ortholoc_edge.tiles.features import FeatureIndex
 from ortholoc_edge.tiles.georeference import LocalFrame
 from ortholoc_edge.tiles.manifest import Manifest
 from ortholoc_edge.tiles.store import MapStore, WindowTooLargeError
 from ortholoc_edge.tiles.window import MapWindow
 
+logger = logging.getLogger(__name__)
+
 # Paper, "Initial Camera Calibration / Localization": matches below are dropped, where the matcher has one.
 MIN_CONFIDENCE = 0.5
 _MIN_MATCHES = 12
-# Of a first round, to leave other hypotheses untried.
-_CONVINCING_INLIERS = 60
-_CONVINCING_RATIO = 0.35
 # A map picture finer than the frame is no use; a coarser one than this is hard to match (field-notes, scale).
 _MAX_COARSENING = 3.0
 _UNSTATED_SIGMA_PX = 0.5
+# Part of the gate's least number of inliers that a round with stored features needs before the last one, which doubles
+# them and must have them all.
+_BEFORE_LOOKING_AGAIN = 0.67
 
 
 class LocalizerOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -60,6 +67,8 @@ class LocalizerOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     ``homography_threshold_px``: of AdHoP's RANSAC, at 1024 px. 5, 10 and 20 px gave a recall of 98, 96 and 95 % on
     seneca.
     ``calibrate``: solve for the focal length too.
+    ``precomputed_features``: match with the pack's, where it has some and there is a predicted pose. "auto": where they
+    give no fix, the network looks at the map; "require": it never does; "never": it always does.
     """
 
     adhop: bool = True
@@ -67,55 +76,22 @@ class LocalizerOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     max_window_mpx: Annotated[float, Meta(gt=0, le=64)] = 6.0
     homography_threshold_px: Annotated[float, Meta(gt=0)] = 5.0
     calibrate: bool = False
+    precomputed_features: Literal["auto", "never", "require"] = "auto"
     gate: gate.GateOptions = field(default_factory=gate.GateOptions)
 
 
-class _RejectedError(Exception):
-    """Carries a rejection out of a stage to `Localizer.localize`, its only catcher."""
-
-    def __init__(self, reason: Reason, detail: str, measured: float | None = None, limit: float | None = None) -> None:
-        super().__init__(detail)
-        self.reason, self.detail, self.measured, self.limit = reason, detail, measured, limit
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class _Round:
-    """One matching round.
-
-    Attributes:
-        matches: frame pixels (undistorted) and DOP pixels, filtered.
-        kept: indices of the matches that have a height.
-        points_map: (M, 3) their points.
-        estimate: the pose in the local frame, or None.
-        mean_error_px: of all M under that pose, each cut at the image's diagonal; infinite without a pose.
-    """
-
-    matches: Matches
-    kept: np.ndarray
-    points_map: FloatArray
-    estimate: pnp.PoseEstimate | None
-    mean_error_px: float
-
-    @property
-    def inliers(self) -> int:
-        return 0 if self.estimate is None else int(np.count_nonzero(self.estimate.inliers))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Scene:
-    """The part of the map to look at.
+class _MapScene:
+    """A scene with its orthophoto.
 
     Attributes:
         window, dop_grey: as read, and its orthophoto in grey.
-        local: metric frame of the region.
-        ground_m: typical height of the surface in it.
-        views: pictures of it to match against, one per hypothesis.
+        views: pictures of it to match against.
     """
 
+    scene: Scene
     window: MapWindow
     dop_grey: ImageArray
-    local: LocalFrame
-    ground_m: float
     views: list[ReferenceView]
 
 
@@ -136,6 +112,25 @@ class Localizer:
         self._map_covariance = _map_covariance(store.pack.manifest)
         # The frame's features are extracted while the map's part is read, warped and extracted.
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="query-features")
+        self._stored = self._stored_matching()
+
+    def _stored_matching(self) -> StoredMatching | None:
+        """With the pack's features, where it has some that fit the matcher and they are wanted.
+
+        Raises: MapError if they are required and there are none.
+        """
+        wanted = self._options.precomputed_features
+        if wanted == "never" or (wanted == "auto" and self._store.pack.manifest.features is None):
+            return None
+        try:
+            index = FeatureIndex(self._store, self.matcher)
+        except MapError as error:
+            if wanted == "require":
+                raise
+            logger.warning("%s; the network looks at the map instead", error)
+            return None
+        assert isinstance(self.matcher, UnscaledMatcher), "the index checks it"
+        return StoredMatching(self.camera, self._working, self.matcher, self._store, index, self._judged)
 
     def close(self) -> None:
         self._worker.shutdown()
@@ -152,13 +147,21 @@ class Localizer:
         trace = Trace()
         try:
             return self._localize(frame, prior, proceed, trace)
-        except _RejectedError as stop:
+        except RejectedError as stop:
             return Rejected(frame.stamp_ns, stop.reason, stop.detail, stop.measured, stop.limit, trace.timings_ms())
         except WindowTooLargeError as error:
             return Rejected(frame.stamp_ns, Reason.PRIOR_TOO_WIDE, str(error), timings_ms=trace.timings_ms())
 
     def _localize(self, frame: Frame, prior: PosePrior | RegionPrior, proceed: Callable[[], bool], trace: Trace) -> Fix:
         grey = self._checked_grey(frame)
+        if self._stored is not None and isinstance(prior, PosePrior):
+            try:
+                return self._by_stored_features(self._stored, frame, grey, prior, proceed, trace)
+            except RejectedError as error:
+                if self._options.precomputed_features == "require" or error.reason is Reason.LATE or not proceed():
+                    raise
+        elif self._options.precomputed_features == "require":
+            raise RejectedError(Reason.NO_PRIOR, "stored features need a predicted pose")
         query = self._worker.submit(self._query_features, grey, trace)
         try:
             scene, first = self._first_round(query, prior, proceed, trace)
@@ -169,7 +172,7 @@ class Localizer:
         finally:
             query.cancel()
         with trace.stage("gate"):
-            fix = self._fix(frame, second or first, scene, prior)
+            fix = self._fix(frame, second or first, scene.scene, prior)
         return replace(
             fix,
             adhop_accepted=second is not None if self._options.adhop else None,
@@ -180,7 +183,7 @@ class Localizer:
         shape, camera = frame.image.shape, self.camera
         size = camera.height, camera.width
         if frame.image.dtype != np.uint8 or shape not in (size, (*size, 3)):
-            raise _RejectedError(
+            raise RejectedError(
                 Reason.BAD_FRAME,
                 f"{frame.name}: {shape} {frame.image.dtype}, but the camera's intrinsics are for "
                 f"{camera.width} x {camera.height} px of 8 bit",
@@ -193,13 +196,71 @@ class Localizer:
         with trace.stage("query_features"):
             return self.matcher.extract(grey)
 
+    def _by_stored_features(
+        self,
+        stored: StoredMatching,
+        frame: Frame,
+        grey: ImageArray,
+        prior: PosePrior,
+        proceed: Callable[[], bool],
+        trace: Trace,
+    ) -> Fix:
+        """The fix without the network on the map. A round must pass the gate before pairs are looked for around its
+        pose, since those will agree with it."""
+        first = self._first_attempt(stored, grey, prior, proceed, trace)
+        again = None
+        if self._options.adhop:
+            try:
+                self._fix(frame, first.found, first.scene, prior, _BEFORE_LOOKING_AGAIN)
+            except RejectedError:
+                first = stored.rectified_again(grey, first, self._homography_threshold_px, trace)
+                self._fix(frame, first.found, first.scene, prior, _BEFORE_LOOKING_AGAIN)
+            again = stored.looked_again(first, trace)
+        with trace.stage("gate"):
+            fix = self._fix(frame, again or first.found, first.scene, prior)
+        return replace(
+            fix,
+            stored_features=True,
+            adhop_accepted=again is not None if self._options.adhop else None,
+            timings_ms=trace.timings_ms(),
+        )
+
+    def _first_attempt(
+        self, stored: StoredMatching, grey: ImageArray, prior: PosePrior, proceed: Callable[[], bool], trace: Trace
+    ) -> Attempt:
+        """As `_first_round`; every stored feature that the prior allows takes part, so no view is widened."""
+        with trace.stage("map_window"):
+            ground = self._predicted_ground(prior)
+        best: Attempt | None = None
+        refused: RejectedError | None = None
+        for number, (hypothesis, widen) in enumerate(self._attempts(prior, ground[1])):
+            if widen and hypothesis is prior:
+                continue
+            if number > 0 and not proceed():
+                raise RejectedError(Reason.LATE, f"{number} hypotheses were tried without one that convinces")
+            try:
+                ground_m, outline = ground if hypothesis is prior else self._predicted_ground(hypothesis)
+                bounds = search_bounds(outline, hypothesis, ground_m, self._options.search_sigmas)
+                gsd_m = self._distance_to_ground(hypothesis, ground_m) / self._working.focal_px
+                attempt = stored.attempt(grey, hypothesis, bounds, outline, ground_m, gsd_m, trace)
+            except RejectedError as error:
+                refused = refused or error
+                continue
+            if best is None or attempt.found.inliers > best.found.inliers:
+                best = attempt
+            if attempt.found.is_convincing:
+                break
+        if best is None:
+            raise refused or RejectedError(Reason.PRIOR_TOO_WIDE, "there is nothing to look at")
+        return best
+
     # -- where to look ---------------------------------------------------------------------------------
 
     def _hypotheses(self, prior: PosePrior, outline: FloatArray) -> list[PosePrior]:
         footprint_m = float(np.ptp(outline, axis=0).min())
         found = hypotheses(prior, footprint_m)
         if found is None:
-            raise _RejectedError(
+            raise RejectedError(
                 Reason.PRIOR_TOO_WIDE,
                 f"heading within {math.degrees(prior.heading_sigma_rad):.0f} deg (1 sigma), views {footprint_m:.0f} m "
                 f"wide: more than {MAX_HYPOTHESES} to try; horizontal 1-sigma, m",
@@ -209,7 +270,7 @@ class Localizer:
 
     def _scene_of_pose(
         self, prior: PosePrior, ground: tuple[float, FloatArray] | None, widen: bool, trace: Trace
-    ) -> _Scene:
+    ) -> _MapScene:
         with trace.stage("map_window"):
             ground_m, outline = ground or self._predicted_ground(prior)
             gsd_m = self._distance_to_ground(prior, ground_m) / self._working.focal_px
@@ -219,31 +280,32 @@ class Localizer:
             local = self._local_frame(window, ground_m)
             plane = precondition.ground_plane(window, local, outline)
             if plane is None:
-                raise _RejectedError(Reason.MAP_NODATA, "the surface model has no data under the predicted view")
+                raise RejectedError(Reason.MAP_NODATA, "the surface model has no data under the predicted view")
             view = precondition.predicted_view(window, dop_grey, local, plane, self._working, prior, widen)
             if not view.valid.any():
-                raise _RejectedError(Reason.MAP_NODATA, "the orthophoto has no data in the predicted view")
-        return _Scene(window, dop_grey, local, ground_m, [view])
+                raise RejectedError(Reason.MAP_NODATA, "the orthophoto has no data in the predicted view")
+        scene = Scene(window, local, ground_m, view.working_from_dop, view.max_shift_px)
+        return _MapScene(scene, window, dop_grey, [view])
 
-    def _scene_of_region(self, prior: RegionPrior, trace: Trace) -> _Scene:
+    def _scene_of_region(self, prior: RegionPrior, trace: Trace) -> _MapScene:
         with trace.stage("map_window"):
             west, south, east, north = prior.bounds_map
             window = self._read(prior.bounds_map, max(east - west, north - south) / self.matcher.working_px)
             dop_grey = precondition.grey_map(window)
             known = window.dsm[np.isfinite(window.dsm)]
             if not len(known):
-                raise _RejectedError(Reason.MAP_NODATA, "the surface model has no data in the region")
+                raise RejectedError(Reason.MAP_NODATA, "the surface model has no data in the region")
             ground_m = float(np.median(known))
         with trace.stage("view"):
             views = precondition.quarter_turns(window, dop_grey)
-        return _Scene(window, dop_grey, self._local_frame(window, ground_m), ground_m, views)
+        return _MapScene(Scene(window, self._local_frame(window, ground_m), ground_m), window, dop_grey, views)
 
     def _predicted_ground(self, prior: PosePrior) -> tuple[float, FloatArray]:
         """Typical height of the surface in the predicted view, and the view's footprint (K, 2) on it."""
         pose = prior.map_from_camera
         ground_m = self._store.ground_near(pose.translation[:2])
         if ground_m is None:
-            raise _RejectedError(
+            raise RejectedError(
                 Reason.OUTSIDE_MAP,
                 f"no surface model near the predicted position ({pose.translation[0]:.0f}, {pose.translation[1]:.0f})",
             )
@@ -251,7 +313,7 @@ class Localizer:
         for _ in range(2):
             height_m = float(pose.translation[2]) - ground_m
             if height_m <= 0:
-                raise _RejectedError(
+                raise RejectedError(
                     Reason.PRIOR_DISAGREES,
                     "the predicted camera lies below the surface model; check the vertical datum of pack and autopilot",
                     height_m,
@@ -275,7 +337,7 @@ class Localizer:
         # The store may give a level finer by a factor of two than was asked for.
         coarsest_m = math.sqrt((east - west) * (north - south) / limit) * 2.0
         if coarsest_m > _MAX_COARSENING * gsd_m:
-            raise _RejectedError(
+            raise RejectedError(
                 Reason.PRIOR_TOO_WIDE,
                 f"the search would cover {east - west:.0f} x {north - south:.0f} m; pixel for the matcher, m",
                 coarsest_m,
@@ -283,12 +345,12 @@ class Localizer:
             )
         window = self._store.read(bounds, max(gsd_m, coarsest_m))
         if window is None:
-            raise _RejectedError(
+            raise RejectedError(
                 Reason.OUTSIDE_MAP,
                 f"({west:.0f}, {south:.0f}) to ({east:.0f}, {north:.0f}) does not meet the pack",
             )
         if not window.dop_valid.any():
-            raise _RejectedError(Reason.MAP_NODATA, "the orthophoto has no data in the region")
+            raise RejectedError(Reason.MAP_NODATA, "the orthophoto has no data in the region")
         return window
 
     def _local_frame(self, window: MapWindow, ground_m: float) -> LocalFrame:
@@ -299,33 +361,35 @@ class Localizer:
 
     def _first_round(
         self, query: Future[Features], prior: PosePrior | RegionPrior, proceed: Callable[[], bool], trace: Trace
-    ) -> tuple[_Scene, _Round]:
+    ) -> tuple[_MapScene, Round]:
         """The best of what there is to try; the first that convinces ends the search."""
         if isinstance(prior, RegionPrior):
             scene = self._scene_of_region(prior, trace)
             return scene, self._round(query, scene, trace)
         with trace.stage("map_window"):
             ground = self._predicted_ground(prior)
-        best: tuple[_Scene, _Round] | None = None
-        refused: _RejectedError | None = None
+        best: tuple[_MapScene, Round] | None = None
+        refused: RejectedError | None = None
+        is_wide = True
         for number, (hypothesis, widen) in enumerate(self._attempts(prior, ground[1])):
+            if number > 0 and hypothesis is prior and not is_wide:
+                # Not wide enough to be widened: it would be the first attempt again.
+                continue
             if number > 0 and not proceed():
-                raise _RejectedError(Reason.LATE, f"{number} hypotheses were tried without one that convinces")
+                raise RejectedError(Reason.LATE, f"{number} hypotheses were tried without one that convinces")
             try:
                 scene = self._scene_of_pose(hypothesis, ground if hypothesis is prior else None, widen, trace)
-            except _RejectedError as error:
+            except RejectedError as error:
                 refused = refused or error
                 continue
-            if number > 0 and hypothesis is prior and scene.views[0].margin_px == 0:
-                # Not wide enough to be widened: this is the first attempt again.
-                continue
+            is_wide = is_wide and scene.views[0].can_widen
             found = self._round(query, scene, trace)
             if best is None or found.inliers > best[1].inliers:
                 best = scene, found
-            if found.inliers >= _CONVINCING_INLIERS and found.inliers >= _CONVINCING_RATIO * len(found.kept):
+            if found.is_convincing:
                 break
         if best is None:
-            raise refused or _RejectedError(Reason.PRIOR_TOO_WIDE, "there is nothing to look at")
+            raise refused or RejectedError(Reason.PRIOR_TOO_WIDE, "there is nothing to look at")
         return best
 
     def _attempts(self, prior: PosePrior, outline: FloatArray) -> Iterator[tuple[PosePrior, bool]]:
@@ -335,7 +399,7 @@ class Localizer:
         for hypothesis in self._hypotheses(prior, outline):
             yield hypothesis, True
 
-    def _round(self, query: Future[Features], scene: _Scene, trace: Trace) -> _Round:
+    def _round(self, query: Future[Features], scene: _MapScene, trace: Trace) -> Round:
         """Match all pictures of a scene and solve the one with the most matches (paper: "selecting the one
         with most correspondences")."""
         best: tuple[Matches, ReferenceView] | None = None
@@ -349,25 +413,24 @@ class Localizer:
                 best = matches, view
         assert best is not None, "a scene has at least one view"
         with trace.stage("pose"):
-            return self._solved(*best, scene)
+            return self._solved(*best, scene.scene)
 
-    def _near_prediction(self, matches: Matches, predicted: ReferenceView) -> Matches:
-        """Without the matches (frame and DOP pixels) that the prior rules out: they would only outvote others.
+    def _near_prediction(self, matches: Matches, scene: Scene) -> Matches:
+        """Without the matches (frame and grid pixels) that the prior rules out: they would only outvote others.
 
         After matching and not inside it: among only the allowed pairs, mutual neighbours by chance lie close
         enough together to agree on a wrong pose (measured on seneca: one error of 5 m that passed the gate).
         """
-        if math.isinf(predicted.max_shift_px):
+        if scene.working_from_dop is None:
             return matches
         scale = self._working.width / self.camera.width, self._working.height / self.camera.height
-        expected = homography.warp_points(predicted.view_from_dop, matches.map_px) - predicted.margin_px
+        expected = homography.warp_points(scene.working_from_dop, matches.map_px)
         shift = np.linalg.norm(resize_px(matches.query_px, scale) - expected, axis=1)
-        return matches.take(np.flatnonzero(shift <= predicted.max_shift_px))
+        return matches.take(np.flatnonzero(shift <= scene.max_shift_px))
 
-    def _adhop(self, first: _Round, query: Features, scene: _Scene) -> _Round | None:
+    def _adhop(self, first: Round, query: Features, scene: _MapScene) -> Round | None:
         """The paper's refinement: None unless the second round's mean reprojection error is smaller."""
-        threshold_px = self._options.homography_threshold_px * self._max_error_px / pnp.THRESHOLD_PX
-        fitted = fit_homography(first.matches.map_px, first.matches.query_px, threshold_px)
+        fitted = fit_homography(first.matches.map_px, first.matches.query_px, self._homography_threshold_px)
         if fitted is None:
             return None
         working = self._working
@@ -384,20 +447,23 @@ class Localizer:
             scene.dop_grey, scene.window.dop_valid, shrink @ fitted[0], working.width, working.height
         )
         matches = self.matcher.match(query, self.matcher.extract(view.image, view.valid))
-        second = self._solved(matches, view, scene)
+        second = self._solved(matches, view, scene.scene)
         return second if second.mean_error_px < first.mean_error_px else None
 
-    def _solved(self, matches: Matches, view: ReferenceView, scene: _Scene) -> _Round:
+    def _solved(self, matches: Matches, view: ReferenceView, scene: Scene) -> Round:
         """A round's matches back on the orthophoto, filtered, lifted and solved."""
-        on_frame = self.camera.contains(matches.query_px)
-        if matches.confidence is not None:
-            on_frame &= matches.confidence >= MIN_CONFIDENCE
-        matches = matches.take(np.flatnonzero(on_frame))
+        matches = matches.take(np.flatnonzero(self.camera.contains(matches.query_px)))
         matches = Matches(self.camera.undistorted_px(matches.query_px), view.dop_px(matches.map_px), matches.confidence)
+        return self._judged(matches, scene)
+
+    def _judged(self, matches: Matches, scene: Scene) -> Round:
+        """Matches of undistorted frame pixels with pixels of the scene's grid, filtered, lifted and solved."""
         # A pixel off the horizon, or in a corner where the lens model ends, has no counterpart.
         paired = np.isfinite(matches.map_px).all(axis=1) & np.isfinite(matches.query_px).all(axis=1)
+        if matches.confidence is not None:
+            paired &= matches.confidence >= MIN_CONFIDENCE
         matches = matches.take(np.flatnonzero(paired))
-        matches = self._near_prediction(matches, scene.views[0])
+        matches = self._near_prediction(matches, scene)
         lifted = lift(matches.map_px, scene.window)
         estimate = None
         if len(lifted.kept) >= _MIN_MATCHES:
@@ -408,7 +474,11 @@ class Localizer:
             # A match behind the camera has no error in pixels; the image's diagonal stands for it.
             diagonal = math.hypot(self.camera.width, self.camera.height)
             mean_px = float(np.minimum(estimate.errors_px, diagonal).mean())
-        return _Round(matches, lifted.kept, lifted.points_map, estimate, mean_px)
+        return Round(matches, lifted.kept, lifted.points_map, estimate, mean_px)
+
+    @property
+    def _homography_threshold_px(self) -> float:
+        return self._options.homography_threshold_px * self._max_error_px / pnp.THRESHOLD_PX
 
     def _pose(self, points_local: FloatArray, query_px: FloatArray) -> pnp.PoseEstimate | None:
         if self._options.calibrate:
@@ -417,21 +487,27 @@ class Localizer:
 
     # -- judgement -------------------------------------------------------------------------------------
 
-    def _fix(self, frame: Frame, chosen: _Round, scene: _Scene, prior: PosePrior | RegionPrior) -> Fix:
+    def _fix(
+        self, frame: Frame, chosen: Round, scene: Scene, prior: PosePrior | RegionPrior, inliers_needed: float = 1.0
+    ) -> Fix:
+        """
+        Args:
+            inliers_needed: part of the gate's least number of inliers that is enough.
+        """
         estimate = chosen.estimate
         if len(chosen.kept) < _MIN_MATCHES:
-            raise _RejectedError(
+            raise RejectedError(
                 Reason.FEW_MATCHES,
                 f"{len(chosen.matches)} matches, of which with a height",
                 len(chosen.kept),
                 _MIN_MATCHES,
             )
         if estimate is None:
-            raise _RejectedError(Reason.DEGENERATE_GEOMETRY, "the matches do not determine a pose")
+            raise RejectedError(Reason.DEGENERATE_GEOMETRY, "the matches do not determine a pose")
         if estimate.focal_sigma_px is not None:
             relative = estimate.focal_sigma_px / estimate.camera.focal_px
             if relative > calibrate.MAX_RELATIVE_FOCAL_SIGMA:
-                raise _RejectedError(
+                raise RejectedError(
                     Reason.DEGENERATE_GEOMETRY,
                     "focal length and height can't be told apart; relative 1-sigma of the focal length",
                     relative,
@@ -450,10 +526,12 @@ class Localizer:
             height_m,
             prior if isinstance(prior, PosePrior) else None,
             self._max_error_px,
-            self._options.gate,
+            structs.replace(
+                self._options.gate, min_inliers=max(6, round(inliers_needed * self._options.gate.min_inliers))
+            ),
         )
         if refusal is not None:
-            raise _RejectedError(refusal.reason, refusal.detail, refusal.measured, refusal.limit)
+            raise RejectedError(refusal.reason, refusal.detail, refusal.measured, refusal.limit)
         inliers = estimate.inliers
         return Fix(
             stamp_ns=frame.stamp_ns,

@@ -61,6 +61,7 @@ class Fix:
         adhop_accepted: whether the second round gave the pose; None if it was not run.
         query_px, points_map: (M, 2) and (M, 3), the inliers.
         timings_ms: per stage.
+        stored_features: whether the pack's precomputed features gave the pose, and not the network on the map.
     """
 
     stamp_ns: int
@@ -76,6 +77,7 @@ class Fix:
     points_map: FloatArray
     focal_sigma_px: float | None = None
     timings_ms: dict[str, float] = field(default_factory=dict)
+    stored_features: bool = False
 
 
 Outcome = Fix | Rejected

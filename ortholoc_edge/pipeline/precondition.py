@@ -20,7 +20,7 @@ from ortholoc_edge.geometry.grid import bilinear
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.prior import MAX_RANGE_HEIGHTS, PosePrior
 from ortholoc_edge.tiles.georeference import LocalFrame
-from ortholoc_edge.tiles.window import MapWindow
+from ortholoc_edge.tiles.window import MapWindow, SurfaceWindow
 
 _PLANE_SAMPLES = 24
 # A widened view shrinks in the matcher; XFeat bears a factor of two (matchers.md, "Rotation" and "Scale").
@@ -41,6 +41,7 @@ class ReferenceView:
         margin_px: of a predicted view, by which it shows more than the camera on every side.
         max_shift_px: of a predicted view, how far from where it is predicted a thing may lie in the frame, both
             at the working size; infinite where nothing is predicted.
+        can_widen: of a predicted view: the prior is uncertain enough for it to show more.
     """
 
     image: ImageArray
@@ -48,6 +49,13 @@ class ReferenceView:
     view_from_dop: FloatArray
     margin_px: int = 0
     max_shift_px: float = math.inf
+    can_widen: bool = False
+
+    @property
+    def working_from_dop(self) -> FloatArray:
+        """(3, 3) of a predicted view, from DOP pixels to the frame at the working size."""
+        shift = np.array([[1.0, 0.0, -self.margin_px], [0.0, 1.0, -self.margin_px], [0.0, 0.0, 1.0]])
+        return np.asarray(shift @ self.view_from_dop)
 
     def dop_px(self, view_px: FloatArray) -> FloatArray:
         """DOP pixels (N, 2) of pixels of this picture; AdHoP's inverse mapping."""
@@ -84,7 +92,7 @@ class GroundPlane:
     relief_m: float
 
 
-def ground_plane(window: MapWindow, local: LocalFrame, outline_map: FloatArray) -> GroundPlane | None:
+def ground_plane(window: MapWindow | SurfaceWindow, local: LocalFrame, outline_map: FloatArray) -> GroundPlane | None:
     """The plane through the surface model under a footprint.
 
     Twice re-weighted by the median residual, so that roofs and trees bend it little.
@@ -117,7 +125,7 @@ def ground_plane(window: MapWindow, local: LocalFrame, outline_map: FloatArray) 
 
 
 def view_homography(
-    window: MapWindow, local: LocalFrame, plane: FloatArray, camera: Camera, local_from_camera: Rigid3
+    window: MapWindow | SurfaceWindow, local: LocalFrame, plane: FloatArray, camera: Camera, local_from_camera: Rigid3
 ) -> FloatArray:
     """(3, 3) from DOP pixels to pixels of a pinhole camera, for ground on a plane ``z = a + b x + c y``."""
     grid = window.dop_grid.map_from_px_matrix()
@@ -151,10 +159,8 @@ def predicted_view(
         widen: show somewhat more where the prediction is uncertain.
     """
     local_from_camera = local.local_from_map_pose(prior.map_from_camera)
-    shift_px = _predicted_shift(camera, local_from_camera, plane, prior)
-    # A shift of a tenth of the picture costs overlap that can be spared; beyond it, look wider.
-    widening = 0.5 * shift_px / camera.width - 0.1 if widen else 0.0
-    margin = round(min(max(widening, 0.0), _MAX_WIDENING) * max(camera.width, camera.height))
+    wider = _margin_px(camera, local_from_camera, plane, prior)
+    margin = wider if widen else 0
     wide = camera.padded(margin)
     matrix = view_homography(window, local, plane.abc, wide, local_from_camera)
     view = warped(dop_grey, window.dop_valid, matrix, wide.width, wide.height)
@@ -163,8 +169,21 @@ def predicted_view(
         view,
         valid=view.valid if ahead is None else view.valid & ahead,
         margin_px=margin,
-        max_shift_px=shift_px + _SHIFT_FLOOR_PX,
+        max_shift_px=max_shift_px(camera, local_from_camera, plane, prior),
+        can_widen=wider > 0,
     )
+
+
+def _margin_px(camera: Camera, local_from_camera: Rigid3, plane: GroundPlane, prior: PosePrior) -> int:
+    """By how much more a widened view shows, on every side."""
+    # A shift of a tenth of the picture costs overlap that can be spared; beyond it, look wider.
+    widening = 0.5 * _predicted_shift(camera, local_from_camera, plane, prior) / camera.width - 0.1
+    return round(min(max(widening, 0.0), _MAX_WIDENING) * max(camera.width, camera.height))
+
+
+def max_shift_px(camera: Camera, local_from_camera: Rigid3, plane: GroundPlane, prior: PosePrior) -> float:
+    """How far from where it is predicted a thing may lie in the picture."""
+    return _predicted_shift(camera, local_from_camera, plane, prior) + _SHIFT_FLOOR_PX
 
 
 def _predicted_shift(camera: Camera, local_from_camera: Rigid3, plane: GroundPlane, prior: PosePrior) -> float:

@@ -32,6 +32,7 @@ def outcome_record(outcome: Outcome) -> dict[str, Any]:
         "inliers": outcome.inliers,
         "rms_px": outcome.rms_px,
         "adhop_accepted": outcome.adhop_accepted,
+        "stored_features": outcome.stored_features,
         "focal_px": outcome.camera.focal_px,
         "focal_sigma_px": outcome.focal_sigma_px,
         "timings_ms": outcome.timings_ms,

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from ortholoc_edge.geometry.arrays import FloatArray, IntArray
 from ortholoc_edge.geometry.grid import bilinear
-from ortholoc_edge.tiles.window import MapWindow
+from ortholoc_edge.tiles.window import MapWindow, SurfaceWindow
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,8 +25,8 @@ class Lifted:
     kept: IntArray
 
 
-def lift(dop_px: npt.ArrayLike, window: MapWindow) -> Lifted:
-    """3D points of orthophoto pixels (N, 2), by the paper's appendix "Lifting 2D Coordinates in DOP to 3D".
+def lift(dop_px: npt.ArrayLike, window: MapWindow | SurfaceWindow) -> Lifted:
+    """3D points of pixels (N, 2) of ``window.dop_grid``, by the paper's appendix "Lifting 2D Coordinates in DOP to 3D".
 
     DOP and DSM may have grids of their own: the linear map between them goes through map coordinates. A pixel
     off the DSM or next to nodata is dropped, not filled: an invented height biases the pose and the residual

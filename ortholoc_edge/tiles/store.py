@@ -22,7 +22,7 @@ from ortholoc_edge.tiles.lattice import Bounds
 from ortholoc_edge.tiles.layer import LoadedLayer, read_listed
 from ortholoc_edge.tiles.manifest import FeatureTile, FileNote
 from ortholoc_edge.tiles.pack import Pack
-from ortholoc_edge.tiles.window import MapWindow
+from ortholoc_edge.tiles.window import MapWindow, SurfaceWindow
 
 logger = logging.getLogger(__name__)
 
@@ -185,6 +185,25 @@ class MapStore:
         for array in (dop, valid, dsm):
             array.flags.writeable = False
         return MapWindow(dop, valid, dop_grid, dsm, self._dsm.grids[dsm_level].crop(*dsm_window))
+
+    def read_surface(self, grid: RasterGrid, dsm_gsd_m: float) -> SurfaceWindow | None:
+        """Heights under a grid, as `read` gives them with an orthophoto of that grid.
+
+        Returns: None where the DSM has no pixel there.
+        Raises: WindowTooLargeError, MapError after `close`.
+        """
+        level = _coarsest(self._dsm.grids, dsm_gsd_m)
+        window = _pixels(self._dsm.grids[level], grid.bounds, margin=1)
+        if window is None:
+            return None
+        if window.width * window.height > self.max_pixels:
+            raise WindowTooLargeError(
+                f"DSM window of {window.width} x {window.height} px exceeds {self.max_pixels} px;"
+                " ask for a smaller region or a larger dsm_gsd_m"
+            )
+        dsm = self._dsm.read_heights(level, window)
+        dsm.flags.writeable = False
+        return SurfaceWindow(grid, dsm, self._dsm.grids[level].crop(*window))
 
     def feature_bytes(self, dop_index: int) -> bytes | None:
         """File with the features of a tile of the DOP, by its index in the manifest; its SHA-256 was checked. None

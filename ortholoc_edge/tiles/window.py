@@ -24,3 +24,17 @@ class MapWindow:
     dop_grid: RasterGrid
     dsm: Float32Array
     dsm_grid: RasterGrid
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceWindow:
+    """A region's heights without its orthophoto, for what was extracted from that before.
+
+    Attributes:
+        dop_grid: whose pixels places on the map are given in.
+        dsm, dsm_grid: as of `MapWindow`.
+    """
+
+    dop_grid: RasterGrid
+    dsm: Float32Array
+    dsm_grid: RasterGrid

@@ -2,9 +2,8 @@
 
 import cv2
 import numpy as np
-import pytest
 from hypothesis import given
-from strategies import finite, vectors
+from strategies import vectors
 
 from ortholoc_edge.geometry import homography
 
@@ -37,24 +36,3 @@ def test_positive_at_turns_only_the_sign():
     at = [10.0, 20.0]
     for sign in (1.0, -1.0):
         assert np.array_equal(homography.positive_at(sign * TILTED, at), TILTED)
-
-
-@given(finite(0.05, 20.0), finite(-3.1, 3.1), vectors(500.0, 2))
-def test_scale_of_a_similarity_is_its_factor_everywhere(factor, angle, px):
-    c, s = factor * np.cos(angle), factor * np.sin(angle)
-    similar = np.array([[c, -s, 7.0], [s, c, -3.0], [0.0, 0.0, 1.0]])
-    assert homography.local_scale(similar, px) == pytest.approx(factor, rel=1e-6)
-
-
-def test_scale_known_answers():
-    # The square root of the area factor: 4 times 9 gives 6, mirrored or not.
-    assert homography.local_scale(np.diag([4.0, 9.0, 1.0]), [5, 5]) == pytest.approx(6.0)
-    assert homography.local_scale(np.diag([-4.0, 9.0, 1.0]), [5, 5]) == pytest.approx(6.0)
-    # u' = u / (1 - v / 100), v' = v / (1 - v / 100): the area factor is 1 / (1 - v / 100)^3.
-    matrix = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -0.01, 1.0]])
-    assert homography.local_scale(matrix, [0, 50]) == pytest.approx(np.sqrt(8.0), rel=0.02)
-
-
-def test_scale_beyond_the_horizon_is_nan():
-    matrix = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -0.01, 1.0]])
-    assert np.isnan(homography.local_scale(matrix, [0, 150]))

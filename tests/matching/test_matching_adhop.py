@@ -1,13 +1,11 @@
-"""Homographies that are found, homographies that are refused, and exact quarter turns."""
+"""Homographies that are found and homographies that are refused."""
 
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from ortholoc_edge.geometry.homography import warp_points
-from ortholoc_edge.matching.adhop import fit_homography, rotate_quarter, unrotate_px
+from ortholoc_edge.matching.adhop import fit_homography
 
 SHAPE = (768, 1024)
 TILTED = np.array([[0.9, 0.2, 30.0], [-0.15, 1.1, 12.0], [2e-4, -1e-4, 1.0]])
@@ -98,26 +96,3 @@ def test_input_is_checked() -> None:
         fit_homography(np.zeros((5, 2)), np.zeros((6, 2)), 1.0)
     with pytest.raises(ValueError, match="must be positive"):
         fit_homography(_points(20), _points(20), 0.0)
-
-
-@given(
-    st.integers(1, 12),
-    st.integers(1, 12),
-    st.integers(-5, 9),
-    st.sampled_from([(), (3,)]),
-    st.integers(0, 99),
-)
-def test_quarter_turns_come_back_exactly(rows: int, columns: int, k: int, channels: tuple[int, ...], seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    image = rng.integers(0, 255, (rows, columns, *channels), dtype=np.uint8)
-    turned = rotate_quarter(image, k)
-    assert turned.flags.c_contiguous
-    v, u = np.indices(turned.shape[:2])
-    px = unrotate_px(np.stack([u, v], axis=-1), k, image.shape)
-    at = px.astype(int)
-    np.testing.assert_array_equal(px, at)
-    np.testing.assert_array_equal(image[at[..., 1], at[..., 0]], turned)
-    np.testing.assert_array_equal(rotate_quarter(turned, -k), image)
-    # Linear, so that subpixel positions are as exact.
-    half = unrotate_px(np.array([0.25, 0.5]), k, image.shape) - unrotate_px(np.array([0.0, 0.0]), k, image.shape)
-    assert sorted(np.abs(half)) == [0.25, 0.5]
