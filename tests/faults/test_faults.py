@@ -391,7 +391,9 @@ def test_pack_that_cannot_be_flown(crs: str | None, options: PackOptions, remedy
     assert str(pack.path) in str(refused.value)
 
 
-def test_corrupt_pack_keeps_the_daemon_on_the_ground_if_told_so(damaged: Path, tmp_path: Path) -> None:
+def test_corrupt_pack_is_told_to_the_pilot_or_keeps_the_daemon_on_the_ground(
+    damaged: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     rendered.write_picture(tmp_path / "frames" / "a.jpg", rendered.picture(PLACES[0]))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         one.bind(("127.0.0.1", 0))
@@ -399,9 +401,12 @@ def test_corrupt_pack_keeps_the_daemon_on_the_ground_if_told_so(damaged: Path, t
     asked = msgspec.structs.replace(config(damaged, tmp_path / "frames"), link=link)
     daemon = Daemon(asked)
     assert daemon.statistics()["map_files_damaged"] == 1
-    stop = threading.Event()
-    stop.set()
-    daemon.run(stop)
+    texts: list[str] = []
+    monkeypatch.setattr(daemon.link, "connected", lambda: True)
+    monkeypatch.setattr(daemon.link, "send_status_text", lambda severity, text: texts.append(text))
+    daemon.run(threading.Event())
+    assert texts == ["OrthoLoC: 1 map files damaged"]
+    assert "holes in the map: 1 files are damaged or missing, the last dop/" in caplog.text
     with pytest.raises(MapError, match=r"1 damaged or missing files, the first dop/.*require_intact"):
         Daemon(msgspec.structs.replace(asked, map=MapOptions(pack=str(damaged), require_intact=True)))
 
