@@ -101,6 +101,13 @@ class Pack:
         """Of all files that the manifest lists."""
         return sum(note.bytes for note in self.manifest.notes())
 
+    def replaced(self) -> bool:
+        """Whether another pack is at the path now."""
+        try:
+            return read_manifest(self.path / MANIFEST_NAME) != self.manifest
+        except MapError:
+            return False
+
     def verify(self, progress: Progress = lambda what, done, steps: None) -> list[str]:
         """Check every byte of every file, decode every block of every level, and look for files that are not listed.
 

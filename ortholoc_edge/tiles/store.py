@@ -73,7 +73,7 @@ class MapStore:
             features: hold the precomputed features too, if the pack has any.
             require_intact: refuse a pack with holes by damage.
         Raises: MapError for a pack over ``memory_bytes``, before anything is read; for one without any usable tile
-            of DOP or DSM; for a damaged one if it must be intact.
+            of DOP or DSM; for one that was replaced meanwhile; for a damaged one if it must be intact.
         """
         self.pack = pack
         self.max_pixels = max_pixels
@@ -99,6 +99,9 @@ class MapStore:
         self._damaged_features: list[str] = []
         for tile in feature_tiles:
             self._load_features(tile)
+        if self.damaged and pack.replaced():
+            self.close()
+            raise MapError(f"{pack.path}: another pack took its place while it was read; start again")
         if require_intact and self.damaged:
             self.close()
             raise MapError(

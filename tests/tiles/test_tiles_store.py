@@ -464,6 +464,17 @@ def test_file_that_vanishes_after_the_look(copied, pack, caplog):
     assert tile.file in caplog.text
 
 
+def test_pack_that_is_replaced_while_it_is_read_is_refused(copied, pack, tmp_path):
+    """Of the old pack's files only those would be left that both have: holes without damage."""
+    found = Pack.open(copied)
+    other = packs.write_pack(tmp_path / "other", pixels(64, 64), np.zeros((64, 64), dtype=np.float32))
+    shutil.copytree(other.path, copied, dirs_exist_ok=True)
+    with pytest.raises(MapError, match="another pack took its place"):
+        MapStore(found)
+    with MapStore(Pack.open(copied)) as opened:
+        assert opened.damaged == []
+
+
 def replaced(folder, layer, index, data):
     """Put a file in place of a tile and let the manifest say that it belongs there."""
     found = Pack.open(folder)
