@@ -303,9 +303,12 @@ def _beyond_border(sheet: Sheet) -> BoolArray:
 
 
 def infrared(rgb: ImageArray) -> ImageArray:
-    """(H, W) a near-infrared band that goes with a picture: plants are bright, water is dark."""
+    """(H, W) a near-infrared band that goes with a picture: plants are bright, soil and roofs as in red, water dark."""
     red, green, blue = (rgb[..., k].astype(np.int16) for k in range(3))
-    return np.asarray(np.clip(green + 2 * (green - red) + (green - blue), 4, 255), dtype=np.uint8)
+    plants = green + 2 * (green - red) + (green - blue)
+    # Of what is drawn only water is bluer than red.
+    soil = np.where(blue > red, 0, red + red // 4)
+    return np.asarray(np.clip(np.maximum(plants, soil), 4, 255), dtype=np.uint8)
 
 
 # --- files ---
