@@ -63,6 +63,7 @@ from ortholoc_edge.tiles.tasks import (
     Job,
     PrepareJob,
     Record,
+    TileJob,
     finished,
     job_name,
     run_all,
@@ -83,6 +84,8 @@ _MAX_CHECKED_BYTES = 256 * 2**20
 _GROUP_TILES = 3
 # Below the hidden folder: pieces of work, and sources that were made plain.
 _WORK = "work"
+# CPU time of a pixel's features, of that of its compression.
+_FEATURE_EFFORT = 5.0
 # A size budget that was missed is tried again at lower quality, this often.
 _MAX_TRIALS = 4
 
@@ -393,7 +396,7 @@ class _Build:
         self._staged.mkdir()
         plan, settings = self._plan, self._settings
         dop_sources, dsm_sources = self._prepared()
-        jobs: list[DopJob | DsmJob] = [
+        dop_jobs = [
             DopJob(
                 tuple(dop_sources[k] for k in tile.sources),
                 plan.dop.lattice,
@@ -405,7 +408,7 @@ class _Build:
             )
             for tile in plan.dop.tiles
         ]
-        jobs += [
+        dsm_jobs = [
             DsmJob(
                 tuple(dsm_sources[k] for k in tile.sources),
                 plan.dsm.lattice,
@@ -417,14 +420,30 @@ class _Build:
             )
             for tile in plan.dsm.tiles
         ]
-        last = 0.7 if self._model_sha256 is not None else 0.92
-        records = self._done(jobs, 0.2, last, "compressing tiles")
-        count = len(plan.dop.tiles)
-        manifest = self._manifest(records[:count], jobs[:count], records[count:], jobs[count:])
-        if self._model_sha256 is not None:
-            manifest = self._with_features(manifest)
+        feature_jobs: list[FeatureJob] = []
+        if self._options.features is not None and self._model_sha256 is not None:
+            feature_jobs = [
+                FeatureJob(
+                    job.sources,
+                    job.lattice,
+                    job.box,
+                    job.crs,
+                    job.area,
+                    self._options.features,
+                    self._model_sha256,
+                    features.ENCODING,
+                    self._options.features_per_mpx,
+                )
+                for job in dop_jobs
+            ]
+        records = self._done([*dop_jobs, *dsm_jobs, *feature_jobs])
+        dop_records, rest = records[: len(dop_jobs)], records[len(dop_jobs) :]
+        dsm_records, feature_records = rest[: len(dsm_jobs)], rest[len(dsm_jobs) :]
+        manifest = self._manifest(dop_records, dop_jobs, dsm_records, dsm_jobs)
+        if feature_jobs:
+            manifest = self._with_features(manifest, feature_jobs, feature_records)
         self._say(0.92, "checking the orthophoto against the surface model")
-        manifest = self._with_reports(manifest, records[:count], records[count:])
+        manifest = self._with_reports(manifest, dop_records, dsm_records)
         write_manifest(manifest, self._staged / MANIFEST_NAME)
         self._say(0.98, "checking the pack")
         if missing := Pack.open(self._staged).missing:
@@ -449,20 +468,18 @@ class _Build:
             self._say(0.2 * done / len(places), "reading sources")
         return sources[0], sources[1]
 
-    def _done(
-        self, jobs: Sequence[DopJob | DsmJob | FeatureJob], start: float, end: float, what: str
-    ) -> list[Record]:
+    def _done(self, jobs: Sequence[TileJob]) -> list[Record]:
         """Records of all pieces of work, those of an earlier run taken over."""
         records = {job_name(job): finished(job, self._work) for job in jobs}
         waiting = [job for job in jobs if records[job_name(job)] is None]
         if len(waiting) < len(jobs):
             logger.info("%d of %d pieces are there from an earlier run", len(jobs) - len(waiting), len(jobs))
-        done = len(jobs) - len(waiting)
+        total, done = sum(map(_effort, waiting)), 0.0
         for job, made in self._run(waiting):
             assert isinstance(made, Record) and not isinstance(job, PrepareJob), "a tile gives a record"
             records[job_name(job)] = made
-            done += 1
-            self._say(start + (end - start) * done / len(jobs), what)
+            done += _effort(job)
+            self._say(0.2 + 0.72 * done / total, "extracting features" if isinstance(job, FeatureJob) else "tiles")
         return [record for job in jobs if (record := records[job_name(job)]) is not None]
 
     def _run(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, Record | Source]]:
@@ -473,9 +490,9 @@ class _Build:
     def _manifest(
         self,
         dop_records: Sequence[Record],
-        dop_jobs: Sequence[DopJob | DsmJob],
+        dop_jobs: Sequence[DopJob],
         dsm_records: Sequence[Record],
-        dsm_jobs: Sequence[DopJob | DsmJob],
+        dsm_jobs: Sequence[DsmJob],
     ) -> Manifest:
         plan, options, settings = self._plan, self._options, self._settings
         dop_tiles, dsm_tiles = [], []
@@ -491,11 +508,11 @@ class _Build:
                         matchability=round(float(known.mean()) / 100.0, 4) if len(known) else None,
                     )
                 )
-        for tile, job, record in zip(plan.dsm.tiles, dsm_jobs, dsm_records, strict=True):
+        for tile, dsm_job, record in zip(plan.dsm.tiles, dsm_jobs, dsm_records, strict=True):
             if record.bytes:
                 dsm_tiles.append(
                     DsmTile(
-                        **self._tile("dsm", plan.dsm.lattice, tile.box, job, record),
+                        **self._tile("dsm", plan.dsm.lattice, tile.box, dsm_job, record),
                         sources=tuple(dsm_order[tile.sources[k]] for k in record.shown),
                         min_m=record.min_m,
                         max_m=record.max_m,
@@ -598,36 +615,30 @@ class _Build:
         ]
         return vertical, tiles
 
-    def _with_features(self, manifest: Manifest) -> Manifest:
+    def _with_features(
+        self, manifest: Manifest, jobs: Sequence[TileJob], records: Sequence[Record]
+    ) -> Manifest:
+        """With the features of the tiles that are in the pack, bound to them."""
         assert self._options.features is not None and self._model_sha256 is not None, "asked for"
-        jobs = [
-            FeatureJob(
-                str(self._staged / tile.file),
-                tile.sha256,
-                self._options.features,
-                self._model_sha256,
-                self._options.features_per_mpx,
-            )
-            for tile in manifest.dop.tiles
-        ]
+        numbers = {(tile.column, tile.row): number for number, tile in enumerate(manifest.dop.tiles)}
         tiles = []
-        for index, (job, record) in enumerate(
-            zip(jobs, self._done(jobs, 0.7, 0.92, "extracting features"), strict=True)
-        ):
-            if record.bytes:
-                tile = manifest.dop.tiles[index]
-                file = f"features/{Path(tile.file).stem}.npy"
-                self._take(job, file)
-                tiles.append(
-                    FeatureTile(
-                        file=file,
-                        bytes=record.bytes,
-                        sha256=record.sha256,
-                        dop=index,
-                        dop_sha256=tile.sha256,
-                        counts=record.counts,
-                    )
+        for job, record in zip(jobs, records, strict=True):
+            number = numbers.get((job.box.column, job.box.row))
+            if not record.bytes or number is None:
+                continue
+            tile = manifest.dop.tiles[number]
+            file = f"features/{Path(tile.file).stem}.npy"
+            self._take(job, file)
+            tiles.append(
+                FeatureTile(
+                    file=file,
+                    bytes=record.bytes,
+                    sha256=record.sha256,
+                    dop=number,
+                    dop_sha256=tile.sha256,
+                    counts=record.counts,
                 )
+            )
         layer = FeatureLayer(
             matcher=self._options.features,
             model_sha256=self._model_sha256,
@@ -695,6 +706,11 @@ class _Build:
         for problem in problems:
             logger.warning("%s", problem)
         return found
+
+
+def _effort(job: TileJob) -> float:
+    """CPU time of a piece of work, roughly and relative to others: for the progress."""
+    return job.box.width * job.box.height * (_FEATURE_EFFORT if isinstance(job, FeatureJob) else 1.0)
 
 
 def _shown(layer: LayerPlan, records: Sequence[Record]) -> dict[int, int]:

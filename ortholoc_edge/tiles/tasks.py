@@ -30,11 +30,11 @@ from rasterio.errors import RasterioError
 from rasterio.io import MemoryFile
 
 from ortholoc_edge.errors import ConfigError, MapError, OrtholocError
-from ortholoc_edge.geometry.arrays import BoolArray, Float32Array
+from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, ImageArray
 from ortholoc_edge.matching.registry import make_matcher
 from ortholoc_edge.tiles import coverage, encode, features, matchability
 from ortholoc_edge.tiles.area import MapArea
-from ortholoc_edge.tiles.cog import Cog, PixelWindow, quiet_georeference
+from ortholoc_edge.tiles.cog import Cog, quiet_georeference
 from ortholoc_edge.tiles.holes import fill_small_holes
 from ortholoc_edge.tiles.lattice import LEVELS, Lattice, PixelBox
 from ortholoc_edge.tiles.manifest import encode_crcs
@@ -120,16 +120,21 @@ class DsmJob:
 
 @dataclass(frozen=True, slots=True)
 class FeatureJob:
-    """Features of a finished DOP tile, as it will be decoded in flight."""
+    """Features of one tile of the orthophoto, from the sources and not from what compression leaves of them."""
 
-    dop_path: str
-    dop_sha256: str
+    sources: tuple[Source, ...]
+    lattice: Lattice
+    box: PixelBox
+    crs: str | None
+    area: MapArea | None
     matcher: str
     model_sha256: str
+    encoding: str
     per_mpx: float
 
 
-Job = PrepareJob | DopJob | DsmJob | FeatureJob
+TileJob = DopJob | DsmJob | FeatureJob
+Job = PrepareJob | TileJob
 _J = TypeVar("_J", bound=Job)
 Run = Callable[[Job, Path], "Record | Source"]
 
@@ -138,16 +143,13 @@ def job_name(job: Job) -> str:
     """Hash of all that goes into a piece of work."""
     digest = hashlib.sha256()
     digest.update(f"{_RECIPE} {type(job).__name__} {rasterio.__version__} {rasterio.__gdal_version__}".encode())
-    if not isinstance(job, FeatureJob):
-        sources = (job.source,) if isinstance(job, PrepareJob) else job.sources
-        for source in sources:
-            digest.update(fingerprint(source).encode())
-    if isinstance(job, DopJob | DsmJob):
+    sources = (job.source,) if isinstance(job, PrepareJob) else job.sources
+    for source in sources:
+        digest.update(fingerprint(source).encode())
+    if not isinstance(job, PrepareJob):
         rest = tuple(getattr(job, name) for name in job.__slots__ if name not in ("sources", "area"))
         digest.update(repr(rest).encode())
         digest.update(_area_key(job.area))
-    elif isinstance(job, FeatureJob):
-        digest.update(repr((job.dop_sha256, job.matcher, job.model_sha256, job.per_mpx)).encode())
     return digest.hexdigest()[:32]
 
 
@@ -159,7 +161,7 @@ def _area_key(area: MapArea | None) -> bytes:
     return repr((shapes, [(strip.line.tolist(), strip.half_width_m) for strip in area.strips])).encode()
 
 
-def finished(job: DopJob | DsmJob | FeatureJob, folder: Path) -> Record | None:
+def finished(job: TileJob, folder: Path) -> Record | None:
     """The record of an earlier run, if its file is there and has the bytes that it should."""
     name = job_name(job)
     try:
@@ -256,16 +258,26 @@ def _dsm_tile(job: DsmJob) -> tuple[bytes, Record]:
 
 
 def _feature_tile(job: FeatureJob) -> tuple[bytes, Record]:
+    rgb, valid, _, shown = dop_mosaic(job.sources, job.lattice.grid(job.box), job.crs, job.area)
+    if not shown:
+        return b"", Record()
     matcher = _matcher(job.matcher, job.model_sha256)
-    path = Path(job.dop_path)
-    with Cog(path.read_bytes(), path) as cog:
-        levels = []
-        for level, grid in enumerate(cog.grids):
-            bands, valid = cog.read_image(level, PixelWindow(0, 0, grid.width, grid.height))
-            grey = cv2.cvtColor(np.ascontiguousarray(np.moveaxis(bands, 0, -1)), cv2.COLOR_RGB2GRAY)
-            levels.append((np.asarray(grey, dtype=np.uint8), valid))
-    data, counts = features.extract_tile(levels, matcher, job.per_mpx)
+    grey = cv2.cvtColor(np.ascontiguousarray(np.moveaxis(rgb, 0, -1)), cv2.COLOR_RGB2GRAY)
+    data, counts = features.extract_tile(_levels(np.asarray(grey, dtype=np.uint8), valid), matcher, job.per_mpx)
     return data, Record(counts=tuple(counts))
+
+
+def _levels(grey: ImageArray, valid: BoolArray) -> list[tuple[ImageArray, BoolArray]]:
+    """A picture (H, W) and its overviews as GDAL averages them: over the valid pixels, valid where any is."""
+    levels = [(grey, valid)]
+    share = valid.astype(np.float32)
+    for level in range(1, LEVELS):
+        size = grey.shape[1] >> level, grey.shape[0] >> level
+        weight = cv2.resize(share, size, interpolation=cv2.INTER_AREA)
+        total = cv2.resize(grey * share, size, interpolation=cv2.INTER_AREA)
+        mean = np.divide(total, weight, out=np.zeros_like(total), where=weight > 0)
+        levels.append((np.rint(mean).astype(np.uint8), np.asarray(weight > 0, dtype=bool)))
+    return levels
 
 
 @functools.cache
