@@ -13,9 +13,11 @@ from rasterio.errors import RasterioError
 from rasterio.warp import transform_bounds
 
 from ortholoc_edge.errors import ConfigError, MapError
+from ortholoc_edge.geometry.grid import RasterGrid
 from ortholoc_edge.tiles.area import Area, MapArea
 from ortholoc_edge.tiles.georeference import Georeference, VerticalDatum, VerticalKind, projected_crs
 from ortholoc_edge.tiles.lattice import Bounds, Lattice, PixelBox
+from ortholoc_edge.tiles.resample import same_crs
 from ortholoc_edge.tiles.sources import Source, is_copied, transform_caveat
 
 logger = logging.getLogger(__name__)
@@ -24,6 +26,8 @@ logger = logging.getLogger(__name__)
 _MIN_GSD_M, _MAX_GSD_M = 0.002, 100.0
 # Of a pixel per tile: pixel sizes that differ by less are one size written with other digits.
 _SIZE_DIGITS = 6
+# Of a pixel's size: what eight digits of a world file leave out. And in pixels over the raster: what is still copied.
+_SLIP, _SLACK_PX = 1e-7, 1e-3
 # Of the box around the orthophotos: a DSM that covers less is worth a warning.
 _SPARSE_COVERAGE = 0.95
 
@@ -145,7 +149,7 @@ def named_vertical(sources: Sequence[Source]) -> tuple[VerticalKind, int | None]
 
 def bounds_in(source: Source, crs: str | None) -> Bounds:
     """A source's (west, south, east, north) in the pack's CRS."""
-    if source.crs == crs or crs is None or source.crs is None:
+    if crs is None or source.crs is None or same_crs(source.crs, crs):
         return source.grid.bounds
     try:
         west, south, east, north = transform_bounds(source.crs, crs, *source.grid.bounds, densify_pts=21)
@@ -233,20 +237,33 @@ def _layer(
     if gsd_m is not None:
         pixel_m = gsd_m
     lattice = Lattice.over(shared, pixel_m, phase)
+    whole = lattice.box(shared)
+    frame = lattice.grid(whole).bounds
+    own, paired = _under(bounds, lattice, frame), _under(others, lattice, frame)
     tiles = []
-    for box in lattice.tiles(lattice.box(shared)):
-        tile = lattice.grid(box).bounds
-        own = tuple(k for k, one in enumerate(bounds) if _meeting(one, tile) is not None)
+    for box in lattice.tiles(whole):
+        key = lattice.tile_key(box.column, box.row)
         # An orthophoto without heights, or heights without an orthophoto, give no fix.
-        paired = any(_meeting(other, tile) is not None for other in others)
-        if own and paired and (area is None or area.meets(tile)):
-            tiles.append(TilePlan(box, own))
+        if key in own and key in paired and (area is None or area.meets(lattice.grid(box).bounds)):
+            tiles.append(TilePlan(box, tuple(own[key])))
     if not tiles:
         raise MapError(
             f"{sources[0].name} and others: nothing left of {sources[0].kind.upper()} inside the area and the other"
             " layer; check that orthophotos and surface models are of one place"
         )
     return LayerPlan(lattice, tuple(sources), tuple(bounds), tuple(tiles))
+
+
+def _under(boxes: Sequence[Bounds], lattice: Lattice, frame: Bounds) -> dict[tuple[int, int], list[int]]:
+    """Tiles that boxes meet inside ``frame``, by `Lattice.tile_key`, each with the boxes' indices. The cost is that of
+    what meets, not of all boxes times all tiles: a state has 50,000 of each."""
+    met: dict[tuple[int, int], list[int]] = defaultdict(list)
+    for index, bounds in enumerate(boxes):
+        inside = _meeting(bounds, frame)
+        if inside is not None:
+            for part in lattice.tiles(lattice.box(inside)):
+                met[lattice.tile_key(part.column, part.row)].append(index)
+    return met
 
 
 def _pixels(sources: Sequence[Source], bounds: Sequence[Bounds], crs: str | None) -> tuple[float, tuple[float, float]]:
@@ -256,13 +273,14 @@ def _pixels(sources: Sequence[Source], bounds: Sequence[Bounds], crs: str | None
     for source, box in zip(sources, bounds, strict=True):
         grid = source.grid
         square = abs(grid.dx + grid.dy) * max(grid.width, grid.height) < 0.01 * grid.dx
-        if source.crs != crs or not square:
+        if not same_crs(source.crs, crs) or not square:
             continue
-        phase = grid.west % grid.dx, grid.top % grid.dx
-        x, y = (round(value / grid.dx, 2) % 1.0 for value in phase)
-        key = round(grid.dx, _SIZE_DIGITS), x, y
+        pixel_m = _round_size(grid)
+        phase = grid.west % pixel_m, grid.top % pixel_m
+        x, y = (round(value / pixel_m, 2) % 1.0 for value in phase)
+        key = round(pixel_m, _SIZE_DIGITS), x, y
         areas[key] += _area_m2(box)
-        exact.setdefault(key, (grid.dx, phase))
+        exact.setdefault(key, (pixel_m, phase))
     if areas:
         return exact[max(sorted(areas), key=lambda key: round(areas[key]))]
     # Every source is warped: the finest of their pixels, in round millimetres.
@@ -271,6 +289,14 @@ def _pixels(sources: Sequence[Source], bounds: Sequence[Bounds], crs: str | None
         for source, box in zip(sources, bounds, strict=True)
     ]
     return max(round(min(sizes), 3), _MIN_GSD_M), (0.0, 0.0)
+
+
+def _round_size(grid: RasterGrid) -> float:
+    """A pixel's size as it was meant, if over the raster that makes no difference: 0.19999999 of a world file would,
+    counted from the equator, put each tile of a state onto pixels of its own."""
+    size = round(grid.dx, _SIZE_DIGITS)
+    error = abs(size / grid.dx - 1.0)
+    return size if error < _SLIP and error * max(grid.width, grid.height) < _SLACK_PX else grid.dx
 
 
 def _check_overlap(

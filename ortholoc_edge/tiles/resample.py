@@ -33,8 +33,9 @@ _SAME_SCALE = 0.1
 # Share of data below a target pixel's kernel that it needs beside data in its very middle. Four files may meet in
 # one pixel, and none may leave it to the others.
 _MIN_VALID_SHARE = 0.2
-# Heights that differ by more from the nearest cell's are a wall seen as a slope.
-_MAX_INVENTED_M = 1.0
+# Heights that differ by more from the nearest cell's are a wall seen as a slope: m, and per metre of the cell, for half
+# a cell of 30 m up a mountain's flank is more than a wall.
+_MAX_INVENTED_M, _MAX_INVENTED_PER_GSD = 1.0, 1.0
 # Target pixels per side of one step, and source pixels that one step may read.
 _STEP_PX = 1024
 _MAX_STEP_SOURCE_PX = 4 * 2**20
@@ -79,7 +80,19 @@ def same_crs(one: str | None, other: str | None) -> bool:
     """Whether two horizontal systems are one, whatever their notation. Raises: MapError for an unreadable one."""
     if one == other or one is None or other is None:
         return one == other
-    return bool(_crs(one).equals(_crs(other), ignore_axis_order=True))
+    a, b = _crs(one), _crs(other)
+    if a.equals(b, ignore_axis_order=True):
+        return True
+    # PROJ ignores the order of degrees alone. Rasters have the easting first, whatever their system says: Czech and
+    # Austrian ones and Gauss-Krueger's, which say northing first, are often written without.
+    if not (a.is_projected and b.is_projected):
+        return False
+    axes = [sorted((axis.direction, axis.unit_conversion_factor) for axis in crs.axis_info) for crs in (a, b)]
+    return bool(
+        axes[0] == axes[1]
+        and a.coordinate_operation == b.coordinate_operation
+        and a.geodetic_crs.equals(b.geodetic_crs, ignore_axis_order=True)
+    )
 
 
 def is_copied(source: Source, grid: RasterGrid, crs: str | None) -> bool:
@@ -133,10 +146,11 @@ def read_dop(source: Source, grid: RasterGrid, crs: str | None) -> DopPixels:
 def read_dsm(source: Source, grid: RasterGrid, crs: str | None) -> Float32Array:
     """Heights (H, W) float32 in metres on ``grid``, which may reach beyond the source; NaN where there are none.
 
-    As :func:`read_dop`; and where a resampled height differs from the nearest cell's by more than a metre, the
-    latter is taken: between roof and ground there is a wall, not a slope.
+    As :func:`read_dop`; and where a resampled height differs from the nearest cell's by more than a metre, or than
+    the side of a larger cell, the latter is taken: between roof and ground there is a wall, not a slope.
     """
     heights = np.full((grid.height, grid.width), np.nan, np.float32)
+    limit_m = max(_MAX_INVENTED_M, _MAX_INVENTED_PER_GSD * source.gsd_m)
     with opened(source.path, source.where, (source.driver,)) as dataset:
         if is_copied(source, grid, crs):
             box = _direct(source.grid, grid)
@@ -164,7 +178,7 @@ def read_dsm(source: Source, grid: RasterGrid, crs: str | None) -> Float32Array:
                 crs,
             )
             mixed, sharp = values[0], nearest - 1
-            mixed = np.where(np.abs(mixed - sharp) > _MAX_INVENTED_M, sharp, mixed)
+            mixed = np.where(np.abs(mixed - sharp) > limit_m, sharp, mixed)
             usable = (share >= _MIN_VALID_SHARE) & (nearest > 0)
             heights[part] = np.where(usable, mixed + base, np.nan)
     return heights

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 import zipfile
 from collections.abc import Iterator, Sequence
@@ -91,7 +92,9 @@ class _Found:
 
     @property
     def gdal_path(self) -> str:
-        return str(self.file) if self.member is None else f"/vsizip/{{{self.file}}}/{self.member}"
+        # A process of a cluster has another working directory.
+        file = self.file.absolute()
+        return str(file) if self.member is None else f"/vsizip/{{{file}}}/{self.member}"
 
 
 @dataclass(slots=True)
@@ -198,9 +201,7 @@ def _check_alike(sources: list[Source]) -> None:
 def _searched(path: Path, notes: _Notes) -> Iterator[_Found]:
     if path.is_dir():
         rasters, mosaics = [], []
-        for file in sorted(path.rglob("*")):
-            if any(part.startswith(".") for part in file.relative_to(path).parts) or not file.is_file():
-                continue
+        for file in _files(path, notes):
             suffix = file.suffix.lower()
             if suffix == ".zip":
                 rasters.extend(_members(file, notes))
@@ -219,6 +220,21 @@ def _searched(path: Path, notes: _Notes) -> Iterator[_Found]:
         yield _Found(path, None, True)
     else:
         raise MapError(f"{path}: there is no such file; check the path")
+
+
+def _files(folder: Path, notes: _Notes) -> list[Path]:
+    """Files below a folder, sorted, without hidden ones. Links to folders are followed: large data lie on other disks,
+    and what is silently left out is a hole in the map."""
+    files: list[Path] = []
+    seen: set[str] = set()
+    for here, folders, names in os.walk(
+        folder, onerror=lambda err: notes.skipped.append(str(err.filename)), followlinks=True
+    ):
+        real = os.path.realpath(here)
+        folders[:] = [] if real in seen else sorted(name for name in folders if not name.startswith("."))
+        files += [] if real in seen else [Path(here, name) for name in names if not name.startswith(".")]
+        seen.add(real)
+    return sorted(file for file in files if file.is_file())
 
 
 def _members(archive: Path, notes: _Notes) -> list[_Found]:
