@@ -1,0 +1,145 @@
+"""What a review of the builder found wrong, each with the case that shows it."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+from tile_rasters import centres, write_raster
+
+from ortholoc_edge.geometry.grid import RasterGrid
+from ortholoc_edge.tiles.plan import make_plan
+from ortholoc_edge.tiles.resample import same_crs
+from ortholoc_edge.tiles.source import Source
+from ortholoc_edge.tiles.sources import discover, read_dsm
+
+
+def source(kind, grid, crs="EPSG:25832", name="one.tif"):
+    """A source without a file, for plans."""
+    return Source(
+        path=f"/nowhere/{name}",
+        name=name,
+        kind=kind,
+        file=Path(f"/nowhere/{name}"),
+        member=None,
+        grid=grid,
+        gsd_m=grid.gsd_m,
+        crs=crs,
+        vertical=None,
+        date="2023",
+        bands=(1, 2, 3) if kind == "dop" else (1,),
+        driver="GTiff",
+        dtype="uint8" if kind == "dop" else "float32",
+    )
+
+
+def copied(layer, crs):
+    return [not layer.resampled(k, crs) for k in range(len(layer.sources))]
+
+
+@pytest.mark.parametrize("written", [0.2, 0.19999999, 0.2000000028, 0.19999999999])
+def test_pixel_size_of_a_rounded_world_file_copies_all_tiles_of_a_state(written):
+    """Counted from the equator in steps of 0.19999999 m, tiles 12 km apart are on different pixels."""
+    corners = [(500_000.0, 5_400_000.0), (512_000.0, 5_400_000.0), (540_000.0, 5_460_000.0)]
+    dop = [source("dop", RasterGrid(5000, 5000, w, n, written, -written), name=f"{w:.0f}.tif") for w, n in corners]
+    dsm = [source("dsm", RasterGrid(5000, 5000, 499_000.0, 5_461_000.0, 20.0, -20.0))]
+    plan = make_plan(dop, dsm)
+    assert plan.dop.lattice.pixel_m == pytest.approx(0.2, abs=1e-12)
+    assert copied(plan.dop, plan.crs) == [True] * 3
+
+
+def test_pixel_size_that_is_meant_so_is_kept():
+    """A US survey foot in metres is no slip of 0.3048 m."""
+    foot, grid = 1200 / 3937, RasterGrid(300, 300, 500_000.0, 5_400_000.0, 1200 / 3937, -1200 / 3937)
+    far = RasterGrid(300, 300, 500_000.0 + 100_000 * foot, 5_400_000.0, foot, -foot)
+    dop = [source("dop", grid, name="a.tif"), source("dop", far, name="b.tif")]
+    plan = make_plan(dop, [source("dsm", RasterGrid(5000, 500, 499_000.0, 5_401_000.0, 10.0, -10.0))])
+    assert plan.dop.lattice.pixel_m == foot
+    assert copied(plan.dop, plan.crs) == [True] * 2
+
+
+@pytest.mark.parametrize(
+    ("code", "east", "north"),
+    [(3045, 4e5, 5.3e6), (3044, 4e5, 5.3e6), (31468, 4.4e6, 5.3e6), (31256, 4e3, 3.4e5), (3416, 6e5, 5e5)],
+)
+def test_pixels_of_the_same_system_in_other_words_are_kept(code, east, north):
+    """Where EPSG has northing first, Esri's WKT is no code to PROJ, but the same system."""
+    wkt = pyproj.CRS.from_epsg(code).to_wkt("WKT1_ESRI")
+    grid = RasterGrid(1000, 1000, east + 0.3, north + 0.3, 1.0, -1.0)
+    plan = make_plan(
+        [source("dop", grid, wkt)], [source("dsm", replace(grid, west=east + 0.7), wkt)], pack_crs=f"EPSG:{code}"
+    )
+    assert copied(plan.dop, plan.crs) == copied(plan.dsm, plan.crs) == [True]
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [(3044, 25832, True), (3045, 25832, False), (25832, 32632, False), (5652, 25832, False), (2263, 32118, False)],
+)
+def test_systems_are_one_where_their_pixels_are(one, other, same):
+    assert same_crs(f"EPSG:{one}", f"EPSG:{other}") is same
+
+
+def test_plan_of_a_state_takes_seconds():
+    """All sources times all tiles took 12 s for 1600 km2, and would have taken more than an hour for a state."""
+    corners = [(400_000.0 + 1000 * i, 5_400_000.0 + 1000 * j) for i in range(60) for j in range(60)]
+    dop = [source("dop", RasterGrid(5000, 5000, w, n, 0.2, -0.2), name=f"{w:.0f}_{n:.0f}.tif") for w, n in corners]
+    dsm = [source("dsm", RasterGrid(1000, 1000, w, n, 1.0, -1.0), name=f"{w:.0f}_{n:.0f}.tif") for w, n in corners]
+    start = time.process_time()
+    plan = make_plan(dop, dsm)
+    assert time.process_time() - start < 5.0
+    for layer in (plan.dop, plan.dsm):
+        assert layer.pixels * layer.lattice.pixel_m**2 == pytest.approx(3600e6, rel=0.05)
+        for tile in layer.tiles[:: len(layer.tiles) // 40]:
+            west, south, east, north = layer.lattice.grid(tile.box).bounds
+            meeting = [
+                k
+                for k, (w, s, e, n) in enumerate(layer.bounds)
+                if min(e, east) - max(w, west) > 1e-6 and min(n, north) - max(s, south) > 1e-6
+            ]
+            assert list(tile.sources) == meeting
+
+
+@pytest.mark.parametrize(("pixel_m", "size"), [(30.0, 40), (2.0, 500), (25.0, 40)])
+def test_coarse_heights_of_a_steep_flank_have_no_steps(tmp_path, pixel_m, size):
+    """A limit of 1 m made stairs of a 30 m surface model on every slope: 10 m high on this one."""
+
+    def flank(xy):
+        return 1000 + 0.5 * (xy[..., 0] - 400_000) + 0.2 * (xy[..., 1] - 5_300_000)
+
+    grid = RasterGrid(60, 60, 400_000.0, 5_300_000.0, 30.0, -30.0)
+    path = write_raster(tmp_path / "dsm.tif", flank(centres(grid)).astype(np.float32)[None], grid, nodata=-9999.0)
+    target = RasterGrid(size, size, 400_213.0, 5_299_787.0, pixel_m, -pixel_m)
+    heights = read_dsm(discover([path], "dsm")[0], target, "EPSG:32633")
+    assert np.isfinite(heights).all()
+    assert np.abs(heights - flank(centres(target))).max() < 0.01
+
+
+def test_folders_behind_links_are_searched(tmp_path):
+    """Python's rglob passes them over without a word, and what lies on another disk is a hole in the map."""
+    grid = RasterGrid(64, 64, 400_000.0, 5_300_000.0, 1.0, -1.0)
+    disk, given = tmp_path / "disk" / "2023", tmp_path / "given"
+    disk.mkdir(parents=True)
+    (given / ".hidden").mkdir(parents=True)
+    path = write_raster(disk / "one.tif", np.full((1, 64, 64), 300, np.float32), grid, nodata=-9999.0)
+    shutil.copy(path, given / "two.tif")
+    shutil.copy(path, given / ".hidden" / "three.tif")
+    (given / "more").symlink_to(disk)
+    # A loop ends.
+    (disk / "back").symlink_to(given)
+    assert sorted(one.name for one in discover([given], "dsm")) == ["one.tif", "two.tif"]
+
+
+def test_paths_of_sources_hold_in_other_working_directories(tmp_path, monkeypatch):
+    """A worker of a Dask cluster was started elsewhere."""
+    grid = RasterGrid(64, 64, 400_000.0, 5_300_000.0, 1.0, -1.0)
+    write_raster(tmp_path / "dsm.tif", np.full((1, 64, 64), 300, np.float32), grid, nodata=-9999.0)
+    monkeypatch.chdir(tmp_path)
+    (one,) = discover([Path("dsm.tif")], "dsm")
+    monkeypatch.chdir("/")
+    assert (read_dsm(one, grid, "EPSG:32633") == 300).all()
