@@ -268,7 +268,7 @@ def test_tiles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "EPSG:32632" in capsys.readouterr().out
     assert run("tiles", "info", out, "--json") == 0
     facts = json.loads(capsys.readouterr().out)
-    assert facts["dop"]["size_px"] == [300, 200]
+    assert (facts["dop"]["gsd_m"], facts["dop"]["area_km2"]) == (0.5, pytest.approx(0.015))
     assert facts["vertical"]["amsl_minus_map_m"] == -47.0
     assert run("tiles", "verify", out) == 0
     assert "sound" in capsys.readouterr().out
