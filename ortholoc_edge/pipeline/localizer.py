@@ -53,8 +53,8 @@ _MIN_MATCHES = 12
 # A map picture finer than the frame is no use; a coarser one than this is hard to match (field-notes, scale).
 _MAX_COARSENING = 3.0
 _UNSTATED_SIGMA_PX = 0.5
-# Part of the gate's least number of inliers that a round with stored features needs before the last one, which doubles
-# them and must have them all.
+# Part of the gate's least number and ratio of inliers that a round with stored features needs before the last, which
+# doubles them and must have them all.
 _BEFORE_LOOKING_AGAIN = 0.67
 
 
@@ -492,7 +492,7 @@ class Localizer:
     ) -> Fix:
         """
         Args:
-            inliers_needed: part of the gate's least number of inliers that is enough.
+            inliers_needed: part of the gate's least number and ratio of inliers that is enough.
         """
         estimate = chosen.estimate
         if len(chosen.kept) < _MIN_MATCHES:
@@ -518,6 +518,7 @@ class Localizer:
         below = float(self._store.heights(pose.translation[None, :2])[0])
         height_m = float(pose.translation[2]) - (below if math.isfinite(below) else scene.ground_m)
         query_px = chosen.matches.query_px[chosen.kept]
+        limits = self._options.gate
         refusal = gate.check(
             estimate,
             query_px,
@@ -527,7 +528,9 @@ class Localizer:
             prior if isinstance(prior, PosePrior) else None,
             self._max_error_px,
             structs.replace(
-                self._options.gate, min_inliers=max(6, round(inliers_needed * self._options.gate.min_inliers))
+                limits,
+                min_inliers=max(6, round(inliers_needed * limits.min_inliers)),
+                min_inlier_ratio=inliers_needed * limits.min_inlier_ratio,
             ),
         )
         if refusal is not None:

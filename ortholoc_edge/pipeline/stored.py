@@ -31,10 +31,11 @@ from ortholoc_edge.tiles.features import FeatureIndex, StoredFeatures
 from ortholoc_edge.tiles.store import MapStore
 from ortholoc_edge.tiles.window import SurfaceWindow
 
-# Of a canvas, over the frame at its working size; where more is needed, the next coarser scale is used. A frame of 4 by
-# 3 at 45 degrees takes 2.0 on a grid as fine as itself. On seneca at 20 cm frames of 14 cm take 2.5 to 5.5 on the grid
-# of 10 cm: a limit of 4 sends a third to that of 20 cm and raises the median error from 0.25 to 0.45 m.
-_MAX_CANVAS = 5.5
+# Of a canvas, over the square of the matcher's working size; where more is needed, the next coarser scale is used. A
+# frame of 640 x 480 px at 45 degrees takes 1.5 on a grid as fine as itself. On seneca at 20 cm frames of 14 cm take 1.9
+# to 4.1 on the grid of 10 cm: a limit of 3 sends a third to that of 20 cm, and the median error rises from 0.25 to
+# 0.45 m.
+_MAX_CANVAS = 4.1
 # Of a stored descriptor and a full one to match; 0.82 of two full ones, of which quantising takes 5 %.
 _MIN_COSINE = 0.76
 # Of looking again: distance at the working size, and cosine, which is lower than where all pairs compete.
@@ -82,7 +83,7 @@ class StoredMatching:
     ) -> None:
         self._camera, self._working = camera, working
         self._matcher, self._store, self._index, self._judge = matcher, store, index, judge
-        self._max_pixels = round(_MAX_CANVAS * working.width * working.height)
+        self._max_pixels = round(_MAX_CANVAS * matcher.working_px**2)
         self._frame_px_per_working = camera.width / working.width
 
     def attempt(

@@ -40,8 +40,6 @@ MAX_KEYPOINTS: Final = 4096
 PER_MPX: Final = 1250.0
 # Pixels of the pictures in pixels of the DOP.
 SCALES: Final = (0.5, *(float(2**k) for k in range(LEVELS)))
-# A scale may be this much coarser than asked for: on a grid coarser than the frame much of what it shows is lost.
-_MAX_COARSER: Final = 1.15
 
 # Positions count 1/8 px of their scale, from the tile's corner: 16 bits reach 8192 px.
 _STEPS_PER_PX: Final = 8
@@ -328,8 +326,9 @@ class FeatureIndex:
             raise MapError(f"{path}: its features are damaged, or the store was not asked to hold them; copy it again")
 
     def scale_for(self, gsd_m: float) -> int:
-        """Index of the coarsest scale that is no more than 15 % coarser than ``gsd_m``; the finest if none is."""
-        fitting = [k for k, grid in enumerate(self.grids) if grid.gsd_m <= gsd_m * _MAX_COARSER]
+        """Index of the coarsest scale that is no coarser than ``gsd_m``; the finest if none is. On a grid coarser than
+        the frame much of what it shows is lost."""
+        fitting = [k for k, grid in enumerate(self.grids) if grid.gsd_m <= gsd_m]
         return fitting[-1] if fitting else 0
 
     def read(self, bounds_map: Bounds, scale: int) -> StoredFeatures:
