@@ -14,9 +14,9 @@ from rasterio.transform import Affine
 from ortholoc_edge.errors import MapError
 from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, ImageArray
 from ortholoc_edge.geometry.grid import RasterGrid
+from ortholoc_edge.tiles.cog import BLOCK_PX, quiet_georeference
 from ortholoc_edge.tiles.lattice import LEVELS
 
-BLOCK_PX = 512
 NODATA = -9999.0
 
 Compression = Literal["webp", "jpeg"]
@@ -49,7 +49,7 @@ def dop_cog(
         "overview_compress": compression.upper(),
         "overview_quality": quality,
     }
-    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), MemoryFile() as work:
+    with quiet_georeference(), rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), MemoryFile() as work:
         profile = _profile(grid, crs) | {"count": 3, "dtype": "uint8", "photometric": "RGB", "interleave": "pixel"}
         with work.open(**profile) as target:
             target.write(rgb * valid)
@@ -74,7 +74,7 @@ def dsm_cog(heights: Float32Array, grid: RasterGrid, crs: str | None, max_z_erro
             files.append(MemoryFile())
             stored = np.where(np.isnan(values), np.float32(NODATA), values)
             profile = _profile(grid.resized(values.shape[1], values.shape[0]), crs if level == 0 else None)
-            with files[-1].open(count=1, dtype="float32", nodata=NODATA, **profile) as target:
+            with quiet_georeference(), files[-1].open(count=1, dtype="float32", nodata=NODATA, **profile) as target:
                 target.write(stored, 1)
         with MemoryFile(ext=".vrt") as vrt:
             rasterio.shutil.copy(files[0].name, vrt.name, driver="VRT")

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
+import rasterio.shutil
 from affine import Affine
 from replay import rendered
 
@@ -384,7 +385,8 @@ def test_replay_json_and_files(flight: Path, tmp_path: Path, capsys: pytest.Capt
         assert record["te_m"] == pytest.approx(np.linalg.norm(record["position_map_m"] - truth.translation), abs=1e-6)
         overlay = cv2.imread(str(out / "overlays" / f"{record['name']}.png"))[..., ::-1]
         assert coloured(overlay, draw.ESTIMATE) > 50
-        assert coloured(overlay, draw.TRUTH) > 50
+        # Where both fall on one pixel, the estimate's is seen.
+        assert coloured(overlay, draw.TRUTH) > 20
     track = cv2.imread(str(out / "track.png"))[..., ::-1]
     assert coloured(track, draw.TRUTH) > 20
     assert coloured(track, draw.ESTIMATE) > 20
@@ -451,7 +453,7 @@ def sets(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("good", "also"):
         shutil.copytree(flight, data / name)
         for raster in ("dop", "dsm"):
-            shutil.copy(PACK / f"{raster}.tif", data / name / f"{name}_{raster}.tif")
+            rasterio.shutil.copy(PACK / f"{raster}.vrt", data / name / f"{name}_{raster}.tif", driver="GTiff")
     next((data / "also").glob("*_flight.csv")).write_text("nothing\n1\n", encoding="utf-8")
     (data / "good" / "samples").mkdir()
     (data / "good" / "samples" / "a.npz").write_bytes(b"no archive")
