@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import functools
 import json
 import os
 import re
@@ -19,7 +18,7 @@ from ortholoc_edge.errors import ConfigError
 from ortholoc_edge.tiles import features
 from ortholoc_edge.tiles.area import read_area
 from ortholoc_edge.tiles.build import PackOptions, Preview, Workers, build_pack, preview_build
-from ortholoc_edge.tiles.signature import sign
+from ortholoc_edge.tiles.signature import signer
 
 _UNITS = {"": 1.0, "K": 1e3, "M": 1e6, "G": 1e9, "T": 1e12, "KI": 2.0**10, "MI": 2.0**20, "GI": 2.0**30}
 _DEFAULTS = PackOptions()
@@ -204,6 +203,8 @@ def run(args: argparse.Namespace) -> int:
         force=args.force,
         created=_source_date(os.environ.get("SOURCE_DATE_EPOCH")),
     )
+    # Before the pack takes its name: one that must be signed is never there without.
+    finish = None if args.sign is None else signer(args.sign)
     if args.dry_run:
         _print_preview(preview_build(args.dop, args.dsm, args.out, options), args.json)
         return 0
@@ -216,8 +217,6 @@ def run(args: argparse.Namespace) -> int:
             bar.refresh()
 
         workers = Workers(args.jobs, args.dask)
-        # Before the pack takes its name: one that must be signed is never there without.
-        finish = None if args.sign is None else functools.partial(sign, private_key=args.sign)
         pack = build_pack(args.dop, args.dsm, args.out, options, progress, workers, finish)
     print_facts(pack, as_json=args.json)
     if pack.manifest.vertical.amsl_minus_map_m is None:

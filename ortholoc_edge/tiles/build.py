@@ -31,7 +31,6 @@ from ortholoc_edge.tiles.georeference import (
     VerticalKind,
     datum_shift_caveat,
     derive_offsets,
-    derive_vertical,
 )
 from ortholoc_edge.tiles.install import install, work_folder
 from ortholoc_edge.tiles.lattice import CROP_PX, Lattice, PixelBox
@@ -73,6 +72,8 @@ from ortholoc_edge.tiles.tasks import (
 logger = logging.getLogger(__name__)
 
 Progress = Callable[[float, str], None]
+# What heights are measured from, and the EPSG code of that.
+_Heights = tuple[VerticalKind, int | None]
 
 # LERC's error should vanish beside the DSM's own: 2 cm, less for the finer grids of low flights.
 _MAX_Z_ERROR_M = 0.02
@@ -159,8 +160,18 @@ class PackOptions:
                 raise ConfigError(f"{name} {sigma}: must be a length in metres, 0 or more")
         for name in ("dop_date", "dsm_date"):
             date = getattr(self, name)
-            if date is not None and not re.fullmatch(r"\d{4}(-\d{2}(-\d{2})?)?", date):
-                raise ConfigError(f"{name} {date!r}: write it as 2023, 2023-06 or 2023-06-04")
+            if date is not None and not _is_date(date):
+                raise ConfigError(f"{name} {date!r}: write it as 2023, 2023-06 or 2023-06-04, a day of the calendar")
+
+
+def _is_date(text: str) -> bool:
+    if not re.fullmatch(r"\d{4}(-\d{2}(-\d{2})?)?", text):
+        return False
+    try:
+        datetime.strptime((text + "-01-01")[:10], "%Y-%m-%d")
+    except ValueError:
+        return False
+    return True
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,23 +220,26 @@ def build_pack(
     say(0.0, "looking at the sources")
     with block_cache(_BUILD_CACHE_BYTES):
         layers = _discovered(dop, dsm, options)
-        _vertical_kind(options, layers[1])
+        heights = _vertical_kind(options, layers[1])
         model_sha256 = None if options.features is None else features.model_of(options.features)
         with _explained(out), work_folder(out) as folder:
-            plan, settings, _ = _settled(layers, options, folder, estimated=False)
+            plan, settings, _ = _settled(layers, heights, options, folder, estimated=False)
             for trial in range(_MAX_TRIALS):
-                staged = _Build(plan, settings, options, model_sha256, folder, workers, say).run()
+                staged = _Build(plan, settings, heights, options, model_sha256, folder, workers, say).run()
                 size = sum(path.stat().st_size for path in staged.rglob("*") if path.is_file())
                 limit = options.max_size_bytes
                 if limit is None or size <= limit:
                     break
-                if trial == _MAX_TRIALS - 1 or settings.quality <= 10:
+                # Only the orthophoto gives way.
+                dop_bytes = sum(path.stat().st_size for path in (staged / "dop").iterdir())
+                share = 1 - (size - limit) / dop_bytes
+                if trial == _MAX_TRIALS - 1 or settings.quality <= 10 or share <= 0:
                     raise MapError(
                         f"{out}: {size / 1e6:.1f} MB at quality {settings.quality}, more than --max-size allows;"
                         " give it a smaller --area or --dop-gsd a coarser value"
                     )
                 # Bytes of a lossy picture fall somewhat slower than its quality number.
-                lower = int(settings.quality * (limit / size) ** 1.5)
+                lower = int(settings.quality * share**1.5)
                 settings = replace(settings, quality=max(min(lower, settings.quality - 3), 10))
                 logger.info("%s: %.1f MB is too much; again at quality %d", out, size / 1e6, settings.quality)
             if finish is not None:
@@ -246,11 +260,11 @@ def preview_build(
     _check_output(out, (*_paths(dop), *_paths(dsm)), options.force)
     with block_cache(_BUILD_CACHE_BYTES), _explained(out):
         layers = _discovered(_paths(dop), _paths(dsm), options)
-        _vertical_kind(options, layers[1])
+        heights = _vertical_kind(options, layers[1])
         # Not the build's own folder: what is done there already must outlive this.
         there = next(folder for folder in out.parents if folder.is_dir())
         with tempfile.TemporaryDirectory(prefix=f".{out.name}.estimate.", dir=there) as scratch:
-            plan, settings, estimate = _settled(layers, options, Path(scratch))
+            plan, settings, estimate = _settled(layers, heights, options, Path(scratch))
             assert estimate is not None, "asked for"
             return Preview(plan, settings, estimate)
 
@@ -272,8 +286,21 @@ def _check_output(out: Path, sources: Sequence[Path], force: bool) -> None:
     if not force:
         raise MapError(f"{out}: exists already; choose another path, or replace it with --force")
     # --force deletes what it replaces, so it must not take a mistyped path for a pack.
-    if not (out.is_dir() and ((out / MANIFEST_NAME).is_file() or not any(out.iterdir()))):
+    if not (out.is_dir() and (_is_pack(out) or not any(out.iterdir()))):
         raise MapError(f"{out}: exists and is no area pack; it will not be replaced, choose another path")
+    # Found now, not when all tiles are done.
+    if out.is_mount():
+        raise MapError(
+            f"{out}: a file system is mounted there, so it cannot be replaced in one step; name a folder in it"
+        )
+
+
+def _is_pack(folder: Path) -> bool:
+    """Also a damaged one, or of another version. Programs for browsers have a manifest of that name, too."""
+    try:
+        return FORMAT.encode() in (folder / MANIFEST_NAME).read_bytes()
+    except OSError:
+        return False
 
 
 @contextmanager
@@ -320,11 +347,16 @@ def _settings(plan: Plan, options: PackOptions) -> Settings:
 
 
 def _settled(
-    layers: tuple[list[Source], list[Source]], options: PackOptions, folder: Path, estimated: bool = True
+    layers: tuple[list[Source], list[Source]],
+    heights: _Heights,
+    options: PackOptions,
+    folder: Path,
+    estimated: bool = True,
 ) -> tuple[Plan, Settings, Estimate | None]:
     """The plan, at pixel sizes and quality that fit the size budget; with an estimate if there is a budget or one is
     wanted."""
     plan = _planned(layers, options)
+    _check_heights(plan, heights, options)
     settings = _settings(plan, options)
     if options.max_size_bytes is None:
         return plan, settings, Sampler(plan, folder / _WORK).estimate(settings) if estimated else None
@@ -342,7 +374,23 @@ def _settled(
     return _planned(layers, fitted), settings, estimate
 
 
-def _vertical_kind(options: PackOptions, dsm: Sequence[Source]) -> tuple[VerticalKind, int | None]:
+def _check_heights(plan: Plan, heights: _Heights, options: PackOptions) -> None:
+    """Say what is wrong with heights and places in the area now, not when all tiles are done.
+
+    Raises: as `derive_offsets`.
+    """
+    lat_lon = None
+    if plan.crs is not None:
+        west, south, east, north = plan.bounds
+        corners = [(west, south), (east, south), (east, north), (west, north)]
+        lat_lon = lat_lon_of(plan.crs, [((west + east) / 2, (south + north) / 2), *corners])
+        caveat = datum_shift_caveat(plan.crs, (float(lat_lon[0, 0]), float(lat_lon[0, 1])))
+        if caveat is not None:
+            logger.warning("%s: %s", plan.crs, caveat)
+    derive_offsets(*heights, options.geoid_undulation_m, lat_lon)
+
+
+def _vertical_kind(options: PackOptions, dsm: Sequence[Source]) -> _Heights:
     """Kind and EPSG code of the heights, by the options or the sources.
 
     Raises: ConfigError if neither says it: a silent mix-up is an altitude error of 30 to 50 m.
@@ -357,9 +405,11 @@ def _vertical_kind(options: PackOptions, dsm: Sequence[Source]) -> tuple[Vertica
         )
     if kind is None:
         assert named is not None, "checked"
-        return named[0], epsg if epsg is not None else named[1]
+        kind = named[0]
     if named is not None and kind != named[0]:
         logger.warning("%s: its CRS says %s heights, --vertical %s is taken", dsm[0].name, named[0], kind)
+    elif named is not None and epsg is not None and named[1] not in (None, epsg):
+        logger.warning("%s: its CRS says EPSG:%d, --vertical-epsg %d is taken", dsm[0].name, named[1], epsg)
     elif named is not None and epsg is None:
         epsg = named[1]
     return kind, epsg
@@ -372,6 +422,7 @@ class _Build:
         self,
         plan: Plan,
         settings: Settings,
+        heights: _Heights,
         options: PackOptions,
         model_sha256: str | None,
         folder: Path,
@@ -380,6 +431,7 @@ class _Build:
     ) -> None:
         self._plan = plan
         self._settings = settings
+        self._vertical = heights
         self._options = options
         self._model_sha256 = model_sha256
         self._work = folder / _WORK
@@ -592,19 +644,15 @@ class _Build:
 
     def _heights(self, anchor: tuple[float, float], dsm: Dsm) -> tuple[VerticalDatum, list[DsmTile]]:
         """The vertical datum at the anchor, and the tiles with the offsets of their own."""
-        crs, options = self._plan.crs, self._options
-        kind, epsg = _vertical_kind(options, self._plan.dsm.sources)
+        crs, stated_m = self._plan.crs, self._options.geoid_undulation_m
         if crs is None:
-            return derive_vertical(kind, epsg, options.geoid_undulation_m, None), dsm.tiles
+            return derive_offsets(*self._vertical, stated_m, None, quiet=True)[0], dsm.tiles
         centres = []
         for tile in dsm.tiles:
             west, south, east, north = dsm.lattice.grid(tile.box).bounds
             centres.append(((west + east) / 2, (south + north) / 2))
         lat_lon = lat_lon_of(crs, [anchor, *centres])
-        caveat = datum_shift_caveat(crs, (float(lat_lon[0, 0]), float(lat_lon[0, 1])))
-        if caveat is not None:
-            logger.warning("%s: %s", crs, caveat)
-        vertical, amsl, ellipsoid = derive_offsets(kind, epsg, options.geoid_undulation_m, lat_lon)
+        vertical, amsl, ellipsoid = derive_offsets(*self._vertical, stated_m, lat_lon, quiet=True)
         tiles = [
             msgspec.structs.replace(
                 tile,

@@ -425,6 +425,8 @@ def derive_offsets(
     epsg: int | None,
     geoid_undulation_m: float | None,
     lat_lon_deg: npt.ArrayLike | None,
+    *,
+    quiet: bool = False,
 ) -> tuple[VerticalDatum, FloatArray | None, FloatArray | None]:
     """Vertical datum with its two offsets, over an area.
 
@@ -434,6 +436,7 @@ def derive_offsets(
     Args:
         geoid_undulation_m: height of the geoid above the ellipsoid in the area, m.
         lat_lon_deg: (N, 2) places, the anchor first; None for a local frame, where PROJ cannot help.
+        quiet: without the warning, where it was given before.
     Returns: the datum with the offsets at the first place; (N,) ``amsl_minus_map_m`` at the places; (N,)
         ``ellipsoid_minus_map_m``. The arrays are None where the datum's value is, and for a local frame.
     Raises: ConfigError for values that contradict each other, and for heights above the ellipsoid whose geoid
@@ -455,7 +458,14 @@ def derive_offsets(
     amsl_minus_ellipsoid = _grid_offsets("EPSG:4979", f"EPSG:4326+{_EGM96_EPSG}", places)
     if kind == "ellipsoid":
         return _of_ellipsoid(epsg, geoid_undulation_m, amsl_minus_ellipsoid, places)
-    return _of_sea_level(epsg, geoid_undulation_m, amsl_minus_ellipsoid, places)
+    found = _of_sea_level(epsg, geoid_undulation_m, amsl_minus_ellipsoid, places)
+    datum = found[0]
+    if not quiet and datum.amsl_sigma_m is not None and datum.amsl_sigma_m >= _ZERO_LEVEL_SIGMA_M:
+        logger.warning(
+            "%s: PROJ has no geoid grid that leads to EGM96, so heights are taken as AMSL, good to %g m (1 sigma)",
+            datum.name or "heights above a sea level that is not named", datum.amsl_sigma_m,
+        )  # fmt: skip
+    return found
 
 
 def _of_ellipsoid(
@@ -504,10 +514,6 @@ def _of_sea_level(
         amsl = _everywhere(0.0, places)
         derivation = "its zero taken as EGM96's, which is true to about 1 m (NAVD88: 2 m)"
         sigma_m = _NAVD88_SIGMA_M if epsg == _NAVD88_EPSG else _ZERO_LEVEL_SIGMA_M
-        logger.warning(
-            "%s: PROJ has no geoid grid that leads to EGM96, so heights are taken as AMSL, good to %g m (1 sigma)",
-            name or "heights above a sea level that is not named", sigma_m,
-        )  # fmt: skip
     ellipsoid_m = None if ellipsoid is None else float(ellipsoid[0])
     if ellipsoid is None and stated_m is not None:
         ellipsoid_m, ellipsoid = stated_m, _everywhere(stated_m, places)

@@ -7,9 +7,11 @@ Keys are PEM files as OpenSSL writes them.
 
 from __future__ import annotations
 
+import functools
 import logging
 import os
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,10 +33,19 @@ def sign(folder: Path, private_key: Path) -> None:
 
     Raises: MapError without a manifest or where the folder cannot be written; ConfigError for an unusable key.
     """
+    signer(private_key)(folder)
+
+
+def signer(private_key: Path) -> Callable[[Path], None]:
+    """:func:`sign` with a key that is read now, before the hours that a pack may take. Raises: as that."""
+    return functools.partial(_sign, key=_private_key(private_key))
+
+
+def _sign(folder: Path, key: Ed25519PrivateKey) -> None:
     manifest = manifest_bytes(folder / MANIFEST_NAME)
     # Only what is a pack: a signature must not be had for anything.
     parse_manifest(manifest, folder / MANIFEST_NAME)
-    signature = _private_key(private_key).sign(manifest)
+    signature = key.sign(manifest)
     path = folder / SIGNATURE_NAME
     try:
         handle, name = tempfile.mkstemp(prefix=f".{SIGNATURE_NAME}.", dir=folder)

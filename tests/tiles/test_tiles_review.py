@@ -10,9 +10,12 @@ from pathlib import Path
 import numpy as np
 import pyproj
 import pytest
-from tile_rasters import centres, write_raster
+from tile_rasters import centres, write_raster, write_scene
 
+from ortholoc_edge.cli import main
+from ortholoc_edge.errors import ConfigError, MapError
 from ortholoc_edge.geometry.grid import RasterGrid
+from ortholoc_edge.tiles.build import PackOptions, build_pack, preview_build
 from ortholoc_edge.tiles.plan import make_plan
 from ortholoc_edge.tiles.resample import same_crs
 from ortholoc_edge.tiles.source import Source
@@ -143,3 +146,69 @@ def test_paths_of_sources_hold_in_other_working_directories(tmp_path, monkeypatc
     (one,) = discover([Path("dsm.tif")], "dsm")
     monkeypatch.chdir("/")
     assert (read_dsm(one, grid, "EPSG:32633") == 300).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"vertical": "ellipsoid"}, "geoid there is not known"),
+        ({"vertical": "orthometric", "vertical_epsg": 25832}, "no vertical system"),
+        ({"vertical": "unknown", "vertical_epsg": 5773}, "say nothing without the kind"),
+        ({"vertical": "ellipsoid", "geoid_undulation_m": 400.0}, "where no geoid is"),
+    ],
+)
+def test_unusable_heights_are_refused_before_the_work(tmp_path, options, message):
+    """They were found out when all tiles were done, and not at all by the dry run."""
+    dop, dsm = write_scene(tmp_path / "sources")
+    for action in (preview_build, build_pack):
+        with pytest.raises((ConfigError, MapError), match=message):
+            action(dop, dsm, tmp_path / "pack", PackOptions(**options))
+        assert [path.name for path in tmp_path.iterdir()] == ["sources"]
+
+
+def test_warnings_about_heights_come_once_and_with_the_dry_run(tmp_path, caplog):
+    dop, dsm = write_scene(tmp_path / "sources", crs="EPSG:32633+5773")
+    options = PackOptions(vertical="orthometric", vertical_epsg=7837)
+    preview_build(dop, dsm, tmp_path / "pack", options)
+    told = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert sum("its CRS says EPSG:5773, --vertical-epsg 7837 is taken" in text for text in told) == 1
+    assert sum("heights are taken as AMSL" in text for text in told) == 1
+    caplog.clear()
+    build_pack(dop, dsm, tmp_path / "pack", options)
+    assert [record.getMessage() for record in caplog.records if record.levelname == "WARNING"] == told
+
+
+@pytest.mark.parametrize("date", ["2023-13", "2023-02-30", "0000", "2023-6"])
+def test_dates_that_are_none_are_refused_at_once(date):
+    with pytest.raises(ConfigError, match="dsm_date"):
+        PackOptions(dsm_date=date)
+
+
+def test_an_unusable_key_is_refused_before_the_work(tmp_path, capsys):
+    dop, dsm = write_scene(tmp_path / "sources")
+    arguments = ["tiles", "build", "--dop", dop, "--dsm", dsm, "--out", tmp_path / "pack", "--vertical", "unknown"]
+    assert main([*map(str, arguments), "--sign", str(tmp_path / "none.pem")]) == 78
+    assert "none.pem: private key cannot be read" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["sources"]
+
+
+def test_force_does_not_delete_the_folder_of_another_program(tmp_path):
+    """Extensions of browsers and web applications have a manifest.json, too."""
+    dop, dsm = write_scene(tmp_path / "sources")
+    folder = tmp_path / "extension"
+    folder.mkdir()
+    (folder / "manifest.json").write_text('{"manifest_version": 3}')
+    (folder / "precious.js").write_text("work of a year")
+    with pytest.raises(MapError, match="is no area pack"):
+        build_pack(dop, dsm, folder, PackOptions(vertical="unknown", force=True))
+    assert (folder / "precious.js").read_text() == "work of a year"
+
+
+def test_a_mount_point_is_refused_before_the_work(tmp_path, monkeypatch):
+    """An empty volume at --out: nothing can take its name, which was found out when all tiles were done."""
+    dop, dsm = write_scene(tmp_path / "sources")
+    volume = tmp_path / "volume"
+    volume.mkdir()
+    monkeypatch.setattr(Path, "is_mount", lambda self: self == volume)
+    with pytest.raises(MapError, match="name a folder in it"):
+        build_pack(dop, dsm, volume, PackOptions(vertical="unknown", force=True))
