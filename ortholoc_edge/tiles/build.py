@@ -773,17 +773,11 @@ def _notes(layer: LayerPlan, order: dict[int, int], crs: str | None) -> list[Sou
             name=layer.sources[k].name,
             date=layer.sources[k].date,
             crs=layer.sources[k].crs,
-            gsd_m=_gsd(layer, k),
+            gsd_m=round(layer.sources[k].gsd_m, 6),
             resampled=layer.resampled(k, crs),
         )
         for k in order
     ]
-
-
-def _gsd(layer: LayerPlan, index: int) -> float:
-    west, south, east, north = layer.bounds[index]
-    grid = layer.sources[index].grid
-    return round(float(np.sqrt((east - west) * (north - south) / (grid.width * grid.height))), 6)
 
 
 def _described(settings: Settings) -> str:
