@@ -34,7 +34,7 @@ def test_every_command_that_the_readme_names_exists():
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     parser = _parser()
     [actions] = [a for a in parser._actions if hasattr(a, "choices") and a.choices]
-    named = set(re.findall(r"`ortholoc-edge (\w+)", text))
+    named = set(re.findall(r"`ortholoc-edge ([\w-]+)", text))
     assert named <= set(actions.choices)
     assert set(actions.choices) <= named | {"sim"}
 
