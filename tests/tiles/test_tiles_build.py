@@ -25,6 +25,7 @@ from ortholoc_edge.tiles import build
 from ortholoc_edge.tiles.build import PackOptions, build_pack
 from ortholoc_edge.tiles.manifest import layer_bounds
 from ortholoc_edge.tiles.pack import Pack
+from ortholoc_edge.tiles.resample import on_lattice
 from ortholoc_edge.tiles.store import MapStore
 
 
