@@ -187,8 +187,8 @@ class MapArea:
         (west, south), (east, north) = np.min(low, axis=0), np.max(high, axis=0)
         return float(west), float(south), float(east), float(north)
 
-    def mask(self, grid: RasterGrid) -> BoolArray:
-        """(H, W) True for pixels whose centres lie in the area.
+    def mask(self, grid: RasterGrid, *, touched: bool = False) -> BoolArray:
+        """(H, W) True for pixels whose centres lie in the area, or that it touches anywhere.
 
         Strips are as wide as they should be but for `_DISC_TOLERANCE_PX` at bends and ends.
         """
@@ -206,7 +206,9 @@ class MapArea:
                 shapes.append(_shape([_corner_px(outline, grid)]))
         if not shapes:
             return np.zeros((grid.height, grid.width), dtype=np.bool_)
-        burnt = rasterio.features.rasterize(shapes, out_shape=(grid.height, grid.width), dtype=np.uint8)
+        burnt = rasterio.features.rasterize(
+            shapes, out_shape=(grid.height, grid.width), dtype=np.uint8, all_touched=touched
+        )
         return np.asarray(burnt != 0, dtype=np.bool_)
 
     def meets(self, bounds: Bounds) -> bool:

@@ -438,7 +438,7 @@ class _Build:
         self._staged = folder / "pack"
         self._workers = workers
         self._say = say
-        self._files: list[FileNote] = []
+        self._names: dict[TileJob, str] = {}
 
     def run(self) -> Path:
         """Returns: the folder of the complete pack, checked."""
@@ -522,17 +522,24 @@ class _Build:
 
     def _done(self, jobs: Sequence[TileJob]) -> list[Record]:
         """Records of all pieces of work, those of an earlier run taken over."""
-        records = {job_name(job): finished(job, self._work) for job in jobs}
-        waiting = [job for job in jobs if records[job_name(job)] is None]
+        names = {job: job_name(job) for job in jobs}
+        self._names.update(names)
+        records = {job: finished(job, self._work) for job in jobs}
+        waiting = [job for job in jobs if records[job] is None]
         if len(waiting) < len(jobs):
             logger.info("%d of %d pieces are there from an earlier run", len(jobs) - len(waiting), len(jobs))
         total, done = sum(map(_effort, waiting)), 0.0
         for job, made in self._run(waiting):
             assert isinstance(made, Record) and not isinstance(job, PrepareJob), "a tile gives a record"
-            records[job_name(job)] = made
+            if job_name(job) != names[job]:
+                others = " or another" if len(job.sources) > 1 else ""
+                raise MapError(
+                    f"{job.sources[0].where}{others}: was written while the build read it; build again when it is complete"
+                )
+            records[job] = made
             done += _effort(job)
             self._say(0.2 + 0.72 * done / total, "extracting features" if isinstance(job, FeatureJob) else "tiles")
-        return [record for job in jobs if (record := records[job_name(job)]) is not None]
+        return [record for job in jobs if (record := records[job]) is not None]
 
     def _run(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, Record | Source]]:
         return run_all(jobs, self._work, processes=self._workers.processes, dask=self._workers.dask)
@@ -617,7 +624,7 @@ class _Build:
         )
 
     def _tile(
-        self, layer: str, lattice: Lattice, box: PixelBox, job: Job, record: Record
+        self, layer: str, lattice: Lattice, box: PixelBox, job: TileJob, record: Record
     ) -> dict[str, Any]:
         file = f"{layer}/{lattice.tile_name(box)}.tif"
         self._take(job, file)
@@ -633,14 +640,14 @@ class _Build:
             "segment_crc32": record.segment_crc32,
         }
 
-    def _take(self, job: Job, file: str) -> None:
+    def _take(self, job: TileJob, file: str) -> None:
         """The file of a piece of work under its name in the pack; the work keeps it, for a build cut off now."""
         target = self._staged / file
         target.parent.mkdir(parents=True, exist_ok=True)
         try:
-            os.link(self._work / job_name(job), target)
+            os.link(self._work / self._names[job], target)
         except OSError:
-            shutil.copyfile(self._work / job_name(job), target)
+            shutil.copyfile(self._work / self._names[job], target)
 
     def _heights(self, anchor: tuple[float, float], dsm: Dsm) -> tuple[VerticalDatum, list[DsmTile]]:
         """The vertical datum at the anchor, and the tiles with the offsets of their own."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, ImageArray
@@ -30,7 +31,7 @@ class DopMosaic(NamedTuple):
 class DsmMosaic(NamedTuple):
     """Attributes:
     heights: (H, W) float32, NaN where there are none.
-    wanted: (H, W) bool, inside the area.
+    wanted: (H, W) bool, inside the area or the next cell.
     shown: indices of the sources that gave a height.
     """
 
@@ -67,7 +68,7 @@ def dop_mosaic(sources: Sequence[Source], grid: RasterGrid, crs: str | None, are
 def dsm_mosaic(sources: Sequence[Source], grid: RasterGrid, crs: str | None, area: MapArea | None) -> DsmMosaic:
     """The surface model on ``grid``, inside ``area``. Raises: MapError naming a source that cannot be read."""
     heights = np.full((grid.height, grid.width), np.nan, np.float32)
-    wanted = _wanted(grid, area)
+    wanted = _wanted_heights(grid, area)
     shown = []
     for index, source in enumerate(sources):
         missing = wanted & np.isnan(heights)
@@ -79,6 +80,15 @@ def dsm_mosaic(sources: Sequence[Source], grid: RasterGrid, crs: str | None, are
             shown.append(index)
             np.copyto(heights, found, where=new)
     return DsmMosaic(heights, wanted, tuple(shown))
+
+
+def _wanted_heights(grid: RasterGrid, area: MapArea | None) -> BoolArray:
+    """With what it takes to interpolate up to the border: cells may be 30 m large, or the area smaller than one."""
+    if area is None:
+        return np.ones((grid.height, grid.width), bool)
+    # One cell around, as the neighbouring tile sees it.
+    inside = area.mask(grid.crop(-1, -1, grid.width + 2, grid.height + 2), touched=True)
+    return cv2.dilate(inside.astype(np.uint8), np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0
 
 
 def _wanted(grid: RasterGrid, area: MapArea | None) -> BoolArray:

@@ -186,7 +186,10 @@ def _pack_crs(dop: Sequence[Source], dsm: Sequence[Source], wanted: str | None) 
         crs = _majority_crs(dop)
     west, south, east, north = bounds_in(dop[0], crs)
     # The georeference refuses what cannot carry poses: not conformal, not in metres.
-    Georeference(crs, VerticalDatum(kind="unknown"), ((west + east) / 2, (south + north) / 2))
+    try:
+        Georeference(crs, VerticalDatum(kind="unknown"), ((west + east) / 2, (south + north) / 2))
+    except MapError as err:
+        raise MapError(f"{err}; or let the build warp to another system with --pack-crs EPSG:n") from err
     return crs
 
 
@@ -284,11 +287,7 @@ def _pixels(sources: Sequence[Source], bounds: Sequence[Bounds], crs: str | None
     if areas:
         return exact[max(sorted(areas), key=lambda key: round(areas[key]))]
     # Every source is warped: the finest of their pixels, in round millimetres.
-    sizes = [
-        float(np.sqrt(_area_m2(box) / (source.grid.width * source.grid.height)))
-        for source, box in zip(sources, bounds, strict=True)
-    ]
-    return max(round(min(sizes), 3), _MIN_GSD_M), (0.0, 0.0)
+    return max(round(min(source.gsd_m for source in sources), 3), _MIN_GSD_M), (0.0, 0.0)
 
 
 def _round_size(grid: RasterGrid) -> float:

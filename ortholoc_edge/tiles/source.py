@@ -280,7 +280,7 @@ def _quantiles(counts: npt.NDArray[np.int64]) -> tuple[float, float]:
 
 
 def fingerprint(source: Source) -> str:
-    """32 hex digits that change when the file, its place in a ZIP or how it is read changes.
+    """32 hex digits that change when the file, what lies beside it, its place in a ZIP or how it is read changes.
 
     The file counts by path, size and time of change: reading the bytes of a whole state would take hours.
     Raises: MapError if the file is gone.
@@ -290,6 +290,9 @@ def fingerprint(source: Source) -> str:
         with opened(source.path, source.where, (source.driver,)) as dataset:
             files = [source.file, *sorted(Path(name) for name in dataset.files)]
     notes = []
+    # Masks, and what GDAL cannot write into the file itself, as a nodata value of a JPEG 2000.
+    beside = [Path(f"{file}{suffix}") for file in files for suffix in (".msk", ".aux.xml")]
+    files += [file for file in beside if source.member is None and file.is_file()]
     for file in dict.fromkeys(files):
         try:
             stat = file.stat()

@@ -439,8 +439,12 @@ def _referenced(where: str, crs: Any, grid: RasterGrid, kind: Kind) -> dict[str,
 
 
 def _true_gsd(where: str, crs: Any, grid: RasterGrid) -> float:
-    """Side of a pixel in the middle, m: the grid's own in a metric system, else along geodesics."""
-    if crs.is_projected and all(abs(axis.unit_conversion_factor - 1.0) < 1e-12 for axis in crs.axis_info):
+    """Side of a pixel in the middle, m: the grid's own in a metric system, else along geodesics, also on the web's
+    Mercator map, whose metres are half ones at 60 degrees."""
+    method = "" if crs.coordinate_operation is None else crs.coordinate_operation.method_name
+    stretched = "Mercator" in method and "Transverse" not in method and "Oblique" not in method
+    metric = crs.is_projected and all(abs(axis.unit_conversion_factor - 1.0) < 1e-12 for axis in crs.axis_info)
+    if metric and not stretched:
         return grid.gsd_m
     xy = grid.map_from_px(np.array([[0, 0], [1, 0], [0, 1]]) + np.array([grid.width / 2, grid.height / 2]))
     with named_errors(where, "lies outside its reference system"):

@@ -45,7 +45,7 @@ from ortholoc_edge.tiles.sources import Source, fingerprint
 logger = logging.getLogger(__name__)
 
 # Part of every hash: raise it when the same input makes other bytes.
-_RECIPE = 1
+_RECIPE = 2
 _WORKER_CACHE_BYTES = 64 * 2**20
 _PR_SET_PDEATHSIG = 1
 # Of SHA-256, before each record: a disk that lost power may hand back anything.

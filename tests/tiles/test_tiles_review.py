@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import os
 import shutil
 import time
 from dataclasses import replace
@@ -15,11 +17,14 @@ from tile_rasters import centres, write_raster, write_scene
 from ortholoc_edge.cli import main
 from ortholoc_edge.errors import ConfigError, MapError
 from ortholoc_edge.geometry.grid import RasterGrid
+from ortholoc_edge.tiles import tasks
+from ortholoc_edge.tiles.area import read_area
 from ortholoc_edge.tiles.build import PackOptions, build_pack, preview_build
 from ortholoc_edge.tiles.plan import make_plan
 from ortholoc_edge.tiles.resample import same_crs
 from ortholoc_edge.tiles.source import Source
-from ortholoc_edge.tiles.sources import discover, read_dsm
+from ortholoc_edge.tiles.sources import discover, fingerprint, read_dsm
+from ortholoc_edge.tiles.store import MapStore
 
 
 def source(kind, grid, crs="EPSG:25832", name="one.tif"):
@@ -212,3 +217,65 @@ def test_a_mount_point_is_refused_before_the_work(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "is_mount", lambda self: self == volume)
     with pytest.raises(MapError, match="name a folder in it"):
         build_pack(dop, dsm, volume, PackOptions(vertical="unknown", force=True))
+
+
+def test_heights_of_a_coarse_model_reach_to_the_border_of_a_small_area(tmp_path):
+    """Cells of 30 m whose centres lie outside were left out, and with them what lies between."""
+    dop_grid = RasterGrid(640, 640, 400_000.0, 5_300_000.0, 0.6, -0.6)
+    dsm_grid = RasterGrid(40, 40, 399_600.0, 5_300_400.0, 30.0, -30.0)
+    rgb = np.random.default_rng(0).integers(0, 255, (3, 640, 640), np.uint8)
+    dop = write_raster(tmp_path / "dop.tif", rgb, dop_grid)
+    dsm = write_raster(tmp_path / "dsm.tif", np.full((1, 40, 40), 300, np.float32), dsm_grid, nodata=-9999.0)
+    for number, side in enumerate((200, 20)):
+        west, north = 400_061.0, 5_299_943.0
+        area = read_area(f"{west},{north - side},{west + side},{north}", None)
+        pack = build_pack(dop, dsm, tmp_path / f"pack{number}", PackOptions(vertical="unknown", area=area))
+        with MapStore(pack) as store:
+            across = np.linspace(1.0, side - 1.0, 9)
+            xy = np.stack(np.meshgrid(west + across, north - across), axis=-1).reshape(-1, 2)
+            assert np.abs(store.heights(xy) - 300.0).max() < 0.05
+        assert pack.manifest.dsm.tiles[0].valid_fraction < 0.2
+
+
+def test_the_webs_mercator_map_is_measured_on_the_ground(tmp_path):
+    """Its metres are 0.64 of one at 50 degrees; and the remedy is an option of the build."""
+    x, y = pyproj.Transformer.from_crs(4326, 3857, always_xy=True).transform(9.0, 50.0)
+    grid = RasterGrid(500, 500, x, y, 0.3, -0.3)
+    (one,) = discover(
+        [write_raster(tmp_path / "web.tif", np.full((3, 500, 500), 9, np.uint8), grid, "EPSG:3857")], "dop"
+    )
+    assert one.gsd_m == pytest.approx(0.3 * np.cos(np.deg2rad(50.0)), rel=0.005)
+    east, north = pyproj.Transformer.from_crs(4326, 32632, always_xy=True).transform(9.0, 50.0)
+    dsm = [source("dsm", RasterGrid(400, 400, east - 100, north + 100, 1.0, -1.0), "EPSG:32632")]
+    with pytest.raises(MapError, match=r"not conformal.*--pack-crs"):
+        make_plan([one], dsm)
+    assert make_plan([one], dsm, pack_crs="EPSG:32632").dop.lattice.pixel_m == pytest.approx(0.193, abs=0.0015)
+
+
+def test_a_source_that_is_written_while_it_is_read_is_named(tmp_path):
+    """A download that still runs: it ended in a KeyError."""
+    dop, dsm = write_scene(tmp_path / "sources")
+    moments, real = itertools.count(2_000_000_000), tasks.run_job
+
+    def beside_a_download(job, folder):
+        made = real(job, folder)
+        os.utime(dop, (next(moments),) * 2)
+        return made
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tasks, "run_job", beside_a_download)
+        with pytest.raises(MapError, match=r"dop_source\.tif: was written while the build read it"):
+            build_pack(dop, dsm, tmp_path / "pack", PackOptions(vertical="unknown"))
+    assert not (tmp_path / "pack").exists()
+    assert build_pack(dop, dsm, tmp_path / "pack", PackOptions(vertical="unknown")).verify() == []
+
+
+def test_what_lies_beside_a_source_counts(tmp_path):
+    """A mask, or a nodata value for a format that cannot hold one: work done without it is not taken up again."""
+    dop, _ = write_scene(tmp_path)
+    (one,) = discover([dop], "dop")
+    marks = [fingerprint(one)]
+    for suffix in (".msk", ".aux.xml"):
+        Path(f"{dop}{suffix}").write_bytes(b"anything")
+        marks.append(fingerprint(one))
+    assert len(set(marks)) == 3
