@@ -534,7 +534,8 @@ class _Build:
             if job_name(job) != names[job]:
                 others = " or another" if len(job.sources) > 1 else ""
                 raise MapError(
-                    f"{job.sources[0].where}{others}: was written while the build read it; build again when it is complete"
+                    f"{job.sources[0].where}{others}: was written while the build read it; build again when it is"
+                    " complete"
                 )
             records[job] = made
             done += _effort(job)

@@ -45,7 +45,7 @@ class LayerPlan:
     """DOP or DSM.
 
     Attributes:
-        sources: newest first; what lies uppermost.
+        sources: that a tile may show, newest first, which lies uppermost.
         bounds: of each source in the pack's CRS.
     """
 
@@ -254,7 +254,7 @@ def _layer(
             f"{sources[0].name} and others: nothing left of {sources[0].kind.upper()} inside the area and the other"
             " layer; check that orthophotos and surface models are of one place"
         )
-    return LayerPlan(lattice, tuple(sources), tuple(bounds), tuple(tiles))
+    return _without_unused(LayerPlan(lattice, tuple(sources), tuple(bounds), tuple(tiles)))
 
 
 def _under(boxes: Sequence[Bounds], lattice: Lattice, frame: Bounds) -> dict[tuple[int, int], list[int]]:
@@ -324,8 +324,8 @@ def _rounded(bounds: Bounds) -> tuple[float, ...]:
     return tuple(round(v, 1) for v in bounds)
 
 
-def without_unused(layer: LayerPlan) -> LayerPlan:
-    """Without the sources that no tile shows."""
+def _without_unused(layer: LayerPlan) -> LayerPlan:
+    """Without the sources outside the area: of a state's folder a mission needs ten."""
     used = sorted({k for tile in layer.tiles for k in tile.sources})
     number = {k: new for new, k in enumerate(used)}
     tiles = tuple(replace(tile, sources=tuple(number[k] for k in tile.sources)) for tile in layer.tiles)

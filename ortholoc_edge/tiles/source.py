@@ -249,7 +249,7 @@ def with_common_stretch(sources: list[Source]) -> list[Source]:
     balance stays, the infrared on its own. Zeros are left out: they are mostly undeclared collars.
     Raises: MapError if one cannot be read.
     """
-    deep = [source for source in sources if source.kind == "dop" and source.dtype != "uint8"]
+    deep = [source for source in sources if _is_deep(source)]
     if not deep:
         return list(sources)
     colours, infrared = np.zeros(2**16, np.int64), np.zeros(2**16, np.int64)
@@ -268,7 +268,11 @@ def with_common_stretch(sources: list[Source]) -> list[Source]:
                     colours += counts
     rgb = _quantiles(colours)
     stretch = Stretch(rgb, _quantiles(infrared) if infrared.any() else None)
-    return [replace(one, stretch=stretch) if one in deep else one for one in sources]
+    return [replace(one, stretch=stretch) if _is_deep(one) else one for one in sources]
+
+
+def _is_deep(source: Source) -> bool:
+    return source.kind == "dop" and source.dtype != "uint8"
 
 
 def _quantiles(counts: npt.NDArray[np.int64]) -> tuple[float, float]:

@@ -279,3 +279,16 @@ def test_what_lies_beside_a_source_counts(tmp_path):
         Path(f"{dop}{suffix}").write_bytes(b"anything")
         marks.append(fingerprint(one))
     assert len(set(marks)) == 3
+
+
+def test_plan_lists_only_the_sources_of_the_area():
+    """The dry run counted the state's."""
+    corners = [400_000.0 + 1000 * k for k in range(5)]
+    dop = [source("dop", RasterGrid(5000, 5000, w, 5.4e6, 0.2, -0.2), name=f"{w:.0f}.tif") for w in corners]
+    dsm = [source("dsm", RasterGrid(1000, 1000, w, 5.4e6, 1.0, -1.0), name=f"{w:.0f}.tif") for w in corners]
+    area = read_area("402100,5399100,402300,5399300", None)
+    plan = make_plan(dop, dsm, area=area)
+    for layer in (plan.dop, plan.dsm):
+        assert [one.name for one in layer.sources] == ["402000.tif"]
+        assert len(layer.bounds) == 1
+        assert all(tile.sources == (0,) for tile in layer.tiles)
