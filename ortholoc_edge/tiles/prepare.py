@@ -291,7 +291,7 @@ def _without_fill(current: Source, source: Source, path: Path, say: Progress) ->
     with opened(current.path, current.where, (current.driver,)) as dataset:
         collars = []
         for name, marked in (("black", _dark), ("white", _bright)):
-            if name == "white" and current.dtype != "uint8":
+            if name == "white" and current.dtype not in ("uint8", "uint16"):
                 continue
 
             def found(window: Window, marked: Callable[[Any, int], BoolArray] = marked) -> BoolArray:
@@ -335,7 +335,7 @@ def _dark(bands: npt.NDArray[Any], tolerance: int) -> BoolArray:
 
 
 def _bright(bands: npt.NDArray[Any], tolerance: int) -> BoolArray:
-    found: BoolArray = bands.min(axis=0) >= 255 - tolerance
+    found: BoolArray = bands.min(axis=0) >= np.iinfo(bands.dtype).max - tolerance
     return found
 
 

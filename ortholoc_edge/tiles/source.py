@@ -246,7 +246,7 @@ def with_common_stretch(sources: list[Source]) -> list[Source]:
     """Give all 16-bit orthophotos the same linear stretch to 8 bits, so that tiles meet without seams.
 
     From the 0.5 and 99.5 % quantiles of decimated reads of all of them, the three colours together so that their
-    balance stays, the infrared on its own. Zeros are left out: they are mostly undeclared collars.
+    balance stays, the infrared on its own. Zeros and the highest value are left out: mostly undeclared collars.
     Raises: MapError if one cannot be read.
     """
     deep = [source for source in sources if _is_deep(source)]
@@ -261,7 +261,8 @@ def with_common_stretch(sources: list[Source]) -> list[Source]:
                 sample = dataset.read(band, out_shape=shape, resampling=Resampling.nearest)
                 if source.alpha is not None:
                     valid &= dataset.read(source.alpha, out_shape=shape) > 0
-                counts = np.bincount(np.clip(sample[valid & (sample > 0)], 0, 2**16 - 1), minlength=2**16)
+                counted = valid & (sample > 0) & (sample < np.iinfo(sample.dtype).max)
+                counts = np.bincount(sample[counted], minlength=2**16)
                 if band == source.nir:
                     infrared += counts
                 else:

@@ -23,7 +23,7 @@ from ortholoc_edge.tiles.build import PackOptions, build_pack, preview_build
 from ortholoc_edge.tiles.plan import make_plan
 from ortholoc_edge.tiles.resample import same_crs
 from ortholoc_edge.tiles.source import Source
-from ortholoc_edge.tiles.sources import discover, fingerprint, read_dsm
+from ortholoc_edge.tiles.sources import discover, fingerprint, prepare, read_dop, read_dsm, with_common_stretch
 from ortholoc_edge.tiles.store import MapStore
 
 
@@ -292,3 +292,15 @@ def test_plan_lists_only_the_sources_of_the_area():
         assert [one.name for one in layer.sources] == ["402000.tif"]
         assert len(layer.bounds) == 1
         assert all(tile.sources == (0,) for tile in layer.tiles)
+
+
+def test_white_fill_of_16_bits_neither_darkens_the_map_nor_shows(tmp_path):
+    """As brightest pixels of the stretch it made the picture black."""
+    grid = RasterGrid(600, 600, 400_000.0, 5_300_000.0, 0.2, -0.2)
+    bands = np.random.default_rng(0).integers(200, 2000, (3, 600, 600)).astype(np.uint16)
+    bands[:, :, :60] = 2**16 - 1
+    found = with_common_stretch(discover([write_raster(tmp_path / "deep.tif", bands, grid)], "dop"))
+    pixels = read_dop(prepare(found[0], tmp_path / "work"), grid, "EPSG:32633")
+    assert not pixels.valid[:, :60].any()
+    assert pixels.valid[:, 60:].all()
+    assert 120 < pixels.rgb[:, :, 60:].mean() < 135
