@@ -139,6 +139,7 @@ class Daemon:
                     Pack.open(Path(config.map.pack), public_key),
                     cache_bytes=config.map.cache_mb * 2**20,
                     memory_bytes=config.map.memory_mb * 2**20,
+                    features=config.localizer.precomputed_features != "never",
                     require_intact=config.map.require_intact,
                 )
             )

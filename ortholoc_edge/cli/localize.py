@@ -94,6 +94,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--overlay", type=Path, metavar="PNG", help="draw the matched points on the photo")
     matcher_options.add(parser)
+    matcher_options.add_features(parser)
     parser.set_defaults(run=run)
 
 
@@ -114,11 +115,13 @@ def run(args: argparse.Namespace) -> int:
         camera = Camera.from_focal(width, height, float(max(width, height)))
     else:
         raise ConfigError("--intrinsics is missing; give it, or --calibrate to solve for the focal length")
-    with MapStore(Pack.open(args.pack)) as store:
+    with MapStore(Pack.open(args.pack), features=args.features != "never") as store:
         prior = _prior(args, store)
         if isinstance(prior, Rejected):
             return _answer(args, prior, None)
-        options = LocalizerOptions(adhop=not args.no_adhop, calibrate=args.calibrate)
+        options = LocalizerOptions(
+            adhop=not args.no_adhop, calibrate=args.calibrate, precomputed_features=args.features
+        )
         localizer = Localizer(camera, store, matcher_options.matcher(args), options)
         try:
             outcome = localizer.localize(Frame(0, image, args.image.name), prior)

@@ -32,6 +32,17 @@ def add(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--no-adhop", action="store_true", help="one matching round only")
 
 
+def add_features(parser: argparse.ArgumentParser) -> None:
+    """For commands that work on a pack as it is."""
+    parser.add_argument(
+        "--features",
+        choices=("auto", "never", "require"),
+        default="auto",
+        help="match with the pack's precomputed features: where it has some of this model, never, or only with them"
+        " (default: %(default)s)",
+    )
+
+
 def settings(args: argparse.Namespace) -> MatcherOptions:
     """The arguments as the daemon's ``[matcher]`` table."""
     return MatcherOptions(

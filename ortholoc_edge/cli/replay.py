@@ -83,6 +83,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--out", type=Path, metavar="DIR", help="write frames.jsonl, overlays/*.png, track.png and summary.json there"
     )
     matcher_options.add(parser)
+    matcher_options.add_features(parser)
     parser.set_defaults(run=run)
 
 
@@ -93,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
         args.odometer_error / 100.0,
         args.odometer_drift,
     )
-    options = LocalizerOptions(adhop=not args.no_adhop)
+    options = LocalizerOptions(adhop=not args.no_adhop, precomputed_features=args.features)
     samples = sequence.sample_paths(args.sequence)
     kind = prior_used(PriorKind(args.prior), bool(samples))
     if not args.sequence.exists():
@@ -114,7 +115,7 @@ def run(args: argparse.Namespace) -> int:
             results.append(replace(result, image=None))
 
     try:
-        with MapStore(Pack.open(args.pack)) if args.pack is not None else nullcontext() as store:
+        with _store(args) if args.pack is not None else nullcontext() as store:
             if samples:
                 collect(run_samples(samples, matcher, options, kind, noise, args.seed, store), len(samples))
             elif store is not None:
@@ -144,3 +145,7 @@ def run(args: argparse.Namespace) -> int:
             raise OrtholocError(f"{args.out}: can't write summary.json ({err})") from err
     print(encoded.decode() if args.json else report.table(summary))
     return 0
+
+
+def _store(args: argparse.Namespace) -> MapStore:
+    return MapStore(Pack.open(args.pack), features=args.features != "never")

@@ -130,7 +130,7 @@ def _add_size(build: argparse.ArgumentParser) -> None:
         type=float,
         default=_DEFAULTS.features_per_mpx,
         metavar="N",
-        help="features kept per million pixels of each level (default: %(default)g)",
+        help="features kept per million pixels of each scale (default: %(default)g)",
     )
 
 

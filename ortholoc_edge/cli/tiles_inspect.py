@@ -313,6 +313,6 @@ def _feature_rows(features: dict[str, Any] | None) -> list[tuple[str, str]]:
         return [("features", "none")]
     return [
         ("features", f"{features['count']} for {features['matcher']}, {features['encoding']}"),
-        ("  size", f"{features['bytes'] / 1e6:.2f} MB, {features['per_mpx']:g} per Mpx of each level"),
+        ("  size", f"{features['bytes'] / 1e6:.2f} MB, {features['per_mpx']:g} per Mpx of each scale"),
         ("  model", features["model_sha256"]),
     ]

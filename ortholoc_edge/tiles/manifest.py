@@ -156,7 +156,7 @@ class FeatureTile(FileNote, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     Attributes:
         dop: index of the tile in the DOP's list.
         dop_sha256: of the file they were extracted from.
-        counts: features per level.
+        counts: features per scale.
     """
 
     dop: _Index
@@ -171,7 +171,7 @@ class FeatureLayer(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         matcher: that they were extracted with and serve.
         model_sha256: of its graph.
         encoding: of the descriptors, see `tiles.features`.
-        per_mpx: features kept per million pixels of each level.
+        per_mpx: features kept per million pixels of each scale.
     """
 
     matcher: str
@@ -271,8 +271,13 @@ def manifest_bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except FileNotFoundError as err:
+        pack = path.parent
+        if (aside := pack.parent / f".{pack.name}.replaced").exists():
+            raise MapError(
+                f"{pack}: a build was cut off while it replaced this pack; the old one lies at {aside}, rename it back"
+            ) from err
         raise MapError(
-            f"{path.parent}: no area pack, {path.name} is missing; build one with: ortholoc-edge tiles build"
+            f"{pack}: no area pack, {path.name} is missing; build one with: ortholoc-edge tiles build"
         ) from err
     except OSError as err:
         raise MapError(f"{path}: cannot be read ({err.strerror}); check the path and its permissions") from err

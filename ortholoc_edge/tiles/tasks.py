@@ -11,6 +11,7 @@ import hashlib
 import importlib
 import logging
 import os
+import queue
 import signal
 import sys
 import traceback
@@ -48,6 +49,7 @@ logger = logging.getLogger(__name__)
 _RECIPE = 2
 _WORKER_CACHE_BYTES = 64 * 2**20
 _PR_SET_PDEATHSIG = 1
+_DASK_PATIENCE_S = 30.0
 # Of SHA-256, before each record: a disk that lost power may hand back anything.
 _DIGEST_BYTES = 32
 
@@ -395,9 +397,19 @@ def _on_dask(jobs: Sequence[_J], folder: Path, address: str) -> Iterator[tuple[_
         raise ConfigError(f"--dask {address}: no scheduler answers ({err}); start one with: dask scheduler") from err
     with client:
         _check_shared(client, folder, address)
-        futures = {client.submit(_guarded, job, folder, key=f"{job_name(job)}", pure=False): job for job in jobs}
+        futures = {client.submit(_guarded, job, folder, key=job_name(job), pure=False): job for job in jobs}
+        done: queue.Queue[Any] = queue.Queue()
+        for future in futures:
+            future.add_done_callback(done.put)
         try:
-            for future in distributed.as_completed(list(futures), loop=client.loop):
+            while futures:
+                try:
+                    future = done.get(timeout=_DASK_PATIENCE_S)
+                except queue.Empty as err:
+                    # A scheduler whose workers have all gone waits for new ones, for ever.
+                    if not client.scheduler_info()["workers"]:
+                        raise MapError(f"--dask {address}: all workers have gone; start some and build again") from err
+                    continue
                 if future.status != "finished":
                     raise MapError(f"--dask {address}: a task failed ({future.exception()}); see the workers' logs")
                 yield futures.pop(future), _unpacked(future.result())

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from xml.etree import ElementTree as ET
 
-from ortholoc_edge.tiles.encode import BLOCK_PX
+from ortholoc_edge.tiles.cog import BLOCK_PX
 from ortholoc_edge.tiles.lattice import PixelBox
 from ortholoc_edge.tiles.manifest import Dop, Dsm, Tile, layer_box
 
