@@ -111,7 +111,7 @@ def _add_size(build: argparse.ArgumentParser) -> None:
         "--max-z-error",
         type=float,
         metavar="M",
-        help="largest height error by compression, metres (default: the lower of 0.02 and DSM GSD / 20)",
+        help="largest height error by compression, metres (default: the lower of 0.05 and DSM GSD / 20)",
     )
     size.add_argument(
         "--max-hole",

@@ -37,6 +37,8 @@ _BYTES_PER_TILE = 9_000
 
 _QUALITIES = (85, 75, 65, 55, 45)
 _Z_ERRORS_M = (0.02, 0.05, 0.1)
+# Pixels of DSM and DOP of public geodata: 1 m and 20 cm.
+_MAX_DSM_RATIO = 5.0
 _COARSENINGS = (1, 2, 4, 8)
 
 
@@ -168,7 +170,10 @@ def _candidates(wanted: Settings, factor: int) -> list[Settings]:
     """With pixels coarser by ``factor``, from the best to the smallest."""
     qualities = [wanted.quality, *(q for q in _QUALITIES if q < wanted.quality)]
     errors = [wanted.max_z_error_m, *(e for e in _Z_ERRORS_M if e > wanted.max_z_error_m)]
-    coarser = replace(wanted, dop_gsd_m=wanted.dop_gsd_m * factor, dsm_gsd_m=wanted.dsm_gsd_m * factor)
+    dop_gsd_m = wanted.dop_gsd_m * factor
+    # A surface model that is coarse beside the orthophoto costs little, and has nothing to spare.
+    fitting = [k for k in _COARSENINGS if k <= factor and wanted.dsm_gsd_m * k <= _MAX_DSM_RATIO * dop_gsd_m]
+    coarser = replace(wanted, dop_gsd_m=dop_gsd_m, dsm_gsd_m=wanted.dsm_gsd_m * max(fitting, default=1))
     return [
         replace(coarser, quality=qualities[min(k, len(qualities) - 1)], max_z_error_m=errors[min(k, len(errors) - 1)])
         for k in range(max(len(qualities), len(errors)))

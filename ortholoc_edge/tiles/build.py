@@ -75,8 +75,8 @@ Progress = Callable[[float, str], None]
 # What heights are measured from, and the EPSG code of that.
 _Heights = tuple[VerticalKind, int | None]
 
-# LERC's error should vanish beside the DSM's own: 2 cm, less for the finer grids of low flights.
-_MAX_Z_ERROR_M = 0.02
+# LERC's error should vanish beside the DSM's own (0.1 to 0.3 m): 5 cm, less for the finer grids of low flights.
+_MAX_Z_ERROR_M = 0.05
 _MAX_Z_ERROR_PER_GSD = 1.0 / 20.0
 
 _BUILD_CACHE_BYTES = 256 * 2**20
@@ -97,7 +97,7 @@ class PackOptions:
 
     Attributes:
         dop_compression, quality: of the DOP; quality 1-100, WEBP is lossless at 100.
-        max_z_error_m: of the DSM's compression; None: the lower of 2 cm and a twentieth of its GSD.
+        max_z_error_m: of the DSM's compression; None: the lower of 5 cm and a twentieth of its GSD.
         dop_gsd_m, dsm_gsd_m: pixel sizes of the pack; None: those of the sources.
         max_size_bytes: of the whole pack; quality, then pixel sizes give way. None: no limit.
         area: what to keep; None: everything.

@@ -26,7 +26,7 @@ from ortholoc_edge.tiles.window import MapWindow, SurfaceWindow
 
 logger = logging.getLogger(__name__)
 
-CACHE_BYTES = 64 * 2**20
+CACHE_BYTES = 32 * 2**20
 # Of compressed files: about 190 km2 at 4 MB per km2.
 MEMORY_BYTES = 768 * 2**20
 
