@@ -59,10 +59,10 @@ def variants(
         z_errors_m: with the builder's own quality.
         features: per million pixels, precomputed for ``matcher``, with the builder's own quality.
     """
-    plain = PackOptions(vertical="unknown", max_z_error_m=0.02)
+    plain = PackOptions(vertical="unknown", max_z_error_m=0.05)
     found = [Variant("reference: lossless, 0.1 mm", replace(plain, quality=100, max_z_error_m=1e-4))]
-    found += [Variant(f"WEBP {q}, DSM 2 cm", replace(plain, quality=q)) for q in qualities]
-    found += [Variant(f"JPEG {q}, DSM 2 cm", replace(plain, quality=q, dop_compression="jpeg")) for q in jpeg]
+    found += [Variant(f"WEBP {q}, DSM 5 cm", replace(plain, quality=q)) for q in qualities]
+    found += [Variant(f"JPEG {q}, DSM 5 cm", replace(plain, quality=q, dop_compression="jpeg")) for q in jpeg]
     found += [
         Variant(f"WEBP {plain.quality}, DSM {100 * z:g} cm", replace(plain, max_z_error_m=z))
         for z in z_errors_m
@@ -70,7 +70,7 @@ def variants(
     ]
     found += [
         Variant(
-            f"WEBP {plain.quality}, DSM 2 cm, features {n:g}/Mpx",
+            f"WEBP {plain.quality}, DSM 5 cm, features {n:g}/Mpx",
             replace(plain, features=matcher, features_per_mpx=n),
         )
         for n in features

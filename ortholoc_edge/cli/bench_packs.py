@@ -60,7 +60,7 @@ def _add_size(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     )
     size.add_argument("--jpeg", nargs="*", type=int, default=[90, 75, 60], help="qualities (default: %(default)s)")
     size.add_argument(
-        "--z-error", nargs="*", type=float, default=[0.01, 0.05, 0.1, 0.2], metavar="M", help="(default: %(default)s)"
+        "--z-error", nargs="*", type=float, default=[0.01, 0.02, 0.1, 0.2], metavar="M", help="(default: %(default)s)"
     )
     size.add_argument(
         "--features",
