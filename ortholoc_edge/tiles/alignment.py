@@ -88,8 +88,8 @@ def warnings(alignment: Alignment | None, dsm_pixel_m: float) -> list[str]:
     return [
         f"the DSM seems to lie {shift_m:.2f} m ({shift_m / dsm_pixel_m:.1f} of its cells) off the DOP: its edges fit"
         f" best moved by {alignment.east_m:+.2f} m east and {alignment.north_m:+.2f} m north (sigma"
-        f" {alignment.sigma_m:.2f} m, {alignment.samples} places); check the origin of its grid (pixel centre or"
-        " corner) and the reference systems of both"
+        f" {alignment.sigma_m:.2f} m, {alignment.samples} places); shadows alone pull it north by up to"
+        " half a metre; beyond that check the origin of its grid (pixel centre or corner) and the reference systems"
     ]
 
 
