@@ -32,8 +32,9 @@ from ortholoc_edge.geometry.grid import RasterGrid
 BLOCK_PX = 512
 
 # An open level that was read from holds buffers of its own besides GDAL's cache: 1.0 MB of a DOP, 1.7 MB of a DSM
-# (measured). A view lies in at most 4 tiles of either, mostly in one or two.
-MAX_HANDLES = 12
+# (measured). A view lies in at most 4 tiles of either, mostly in one or two; from 2 km above ground it takes in a
+# dozen of each, and with fewer handles than that every read would open them all again.
+MAX_HANDLES = 28
 
 # Of a pixel: what the sums of coordinates of millions of metres may be off.
 _PLACE_SLACK_PX = 1e-3
