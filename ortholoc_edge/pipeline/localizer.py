@@ -208,18 +208,20 @@ class Localizer:
         """The fix without the network on the map. A round must pass the gate before pairs are looked for around its
         pose, since those will agree with it."""
         first = self._first_attempt(stored, grey, prior, proceed, trace)
-        again = None
+        again = before = None
         if self._options.adhop:
             try:
-                self._fix(frame, first.found, first.scene, prior, _BEFORE_LOOKING_AGAIN)
+                before = self._fix(frame, first.found, first.scene, prior, _BEFORE_LOOKING_AGAIN)
             except RejectedError:
                 first = stored.rectified_again(grey, first, self._homography_threshold_px, trace)
-                self._fix(frame, first.found, first.scene, prior, _BEFORE_LOOKING_AGAIN)
+                before = self._fix(frame, first.found, first.scene, prior, _BEFORE_LOOKING_AGAIN)
             again = stored.looked_again(first, trace)
         with trace.stage("gate"):
             fix = self._fix(frame, again or first.found, first.scene, prior)
         return replace(
             fix,
+            # Of pairs that were looked for around a pose most agree with it.
+            quality=fix.quality if before is None else before.quality,
             stored_features=True,
             adhop_accepted=again is not None if self._options.adhop else None,
             timings_ms=trace.timings_ms(),
@@ -242,6 +244,7 @@ class Localizer:
                 ground_m, outline = ground if hypothesis is prior else self._predicted_ground(hypothesis)
                 bounds = search_bounds(outline, hypothesis, ground_m, self._options.search_sigmas)
                 gsd_m = self._distance_to_ground(hypothesis, ground_m) / self._working.focal_px
+                self._coarsest_m(bounds, gsd_m)
                 attempt = stored.attempt(grey, hypothesis, bounds, outline, ground_m, gsd_m, trace)
             except RejectedError as error:
                 refused = refused or error
@@ -331,7 +334,12 @@ class Localizer:
         falling = -float(prior.map_from_camera.rotation[2, 2])
         return height_m / max(falling, 1.0 / MAX_RANGE_HEIGHTS)
 
-    def _read(self, bounds: Bounds, gsd_m: float) -> MapWindow:
+    def _coarsest_m(self, bounds: Bounds, gsd_m: float) -> float:
+        """Pixel of the map at which a region is within `max_window_mpx`.
+
+        Raises: RejectedError if that is too coarse for a frame of ``gsd_m``. Stored features are as many as pixels
+            were: without this limit a prior of 150 m asks for hundreds of thousands.
+        """
         west, south, east, north = bounds
         limit = self._options.max_window_mpx * 1e6
         # The store may give a level finer by a factor of two than was asked for.
@@ -343,7 +351,11 @@ class Localizer:
                 coarsest_m,
                 _MAX_COARSENING * gsd_m,
             )
-        window = self._store.read(bounds, max(gsd_m, coarsest_m))
+        return coarsest_m
+
+    def _read(self, bounds: Bounds, gsd_m: float) -> MapWindow:
+        west, south, east, north = bounds
+        window = self._store.read(bounds, max(gsd_m, self._coarsest_m(bounds, gsd_m)))
         if window is None:
             raise RejectedError(
                 Reason.OUTSIDE_MAP,

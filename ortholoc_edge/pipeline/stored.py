@@ -28,7 +28,7 @@ from ortholoc_edge.pipeline.rounds import RejectedError, Round, Scene
 from ortholoc_edge.pipeline.trace import Trace
 from ortholoc_edge.pose.lift import lift
 from ortholoc_edge.tiles.features import FeatureIndex, StoredFeatures
-from ortholoc_edge.tiles.store import MapStore
+from ortholoc_edge.tiles.store import MapStore, WindowTooLargeError
 from ortholoc_edge.tiles.window import SurfaceWindow
 
 # Of a canvas, over the square of the matcher's working size; where more is needed, the next coarser scale is used. A
@@ -140,7 +140,11 @@ class StoredMatching:
         low = np.floor(grid.px_from_map((west, north))).astype(np.intp)
         width, height = np.ceil(grid.px_from_map((east, south))).astype(np.intp) - low + 1
         near = grid.crop(int(low[0]), int(low[1]), int(width), int(height))
-        surface = self._store.read_surface(near, 2.0 * grid.gsd_m)
+        try:
+            surface = self._store.read_surface(near, 2.0 * grid.gsd_m)
+        except WindowTooLargeError as error:
+            # Of one hypothesis; narrower ones, or the network, may do.
+            raise RejectedError(Reason.PRIOR_TOO_WIDE, str(error)) from error
         if surface is None:
             raise RejectedError(
                 Reason.OUTSIDE_MAP,

@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import io
 import math
+import tokenize
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -322,6 +323,8 @@ class FeatureIndex:
             )
             key = lattice.tile_key(place.column, place.row)
             self._tiles[key] = _Loaded(place.column - west, place.row - top, records, strips)
+        # Its file is read here: none is opened in flight.
+        _codec()
         if not self._tiles:
             raise MapError(f"{path}: its features are damaged, or the store was not asked to hold them; copy it again")
 
@@ -371,7 +374,7 @@ def _unpacked(data: bytes, tile: FeatureTile, scales: int, name: str, remedy: st
         version = np.lib.format.read_magic(file)
         shape, _, dtype = np.lib.format.read_array_header_1_0(file)
         records = np.frombuffer(data, RECORD, offset=file.tell())
-    except ValueError as err:
+    except (ValueError, SyntaxError, tokenize.TokenError) as err:  # NumPy reads a header as an expression of Python's
         raise MapError(f"{name}: no features ({err}); {remedy}") from err
     if version != (1, 0) or dtype != RECORD or shape != records.shape:
         raise MapError(f"{name}: {shape} of {dtype}, expected {len(records)} of {RECORD}; {remedy}")

@@ -28,7 +28,7 @@ from ortholoc_edge.pipeline.rectify import rectified
 from ortholoc_edge.tiles import features
 from ortholoc_edge.tiles.manifest import MANIFEST_NAME, FeatureLayer, FeatureTile, write_manifest
 from ortholoc_edge.tiles.pack import Pack
-from ortholoc_edge.tiles.store import MapStore
+from ortholoc_edge.tiles.store import MapStore, WindowTooLargeError
 
 REACH_M = 105.0
 # Twice the default: map and frames are of two epochs, and a village offers less than most real ground.
@@ -149,6 +149,9 @@ def test_looking_again_doubles_the_inliers(setting: Setting) -> None:
     assert once.adhop_accepted is None
     assert twice.adhop_accepted is True
     assert twice.inliers > 1.3 * once.inliers
+    # Pairs that a pose picked agree with it: their share says nothing of how good the match was.
+    assert twice.inliers / twice.matches > 1.1 * once.quality
+    assert twice.quality == once.quality
 
 
 def test_tilt_and_lens_distortion(setting: Setting) -> None:
@@ -163,6 +166,34 @@ def test_wide_prior_is_searched(setting: Setting) -> None:
     assert assert_near(setting.localize(rendered.frame(NADIR, CAMERA), prior, precomputed_features="require"), NADIR)
     assert setting.matcher.scaled == 0
     assert setting.matcher.unscaled > 1
+
+
+def test_prior_too_wide_for_the_map_is_too_wide_for_its_features(
+    setting: Setting, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Over a large pack they would be hundreds of thousands to match, for seconds and hundreds of megabytes."""
+    asked: list[object] = []
+    monkeypatch.setattr(features.FeatureIndex, "read", lambda *args: asked.append(args))
+    refused = setting.localize(
+        rendered.frame(NADIR, CAMERA), rendered.prior(NADIR, sigma_m=(150.0, 20.0)), max_window_mpx=0.5
+    )
+    assert isinstance(refused, Rejected)
+    assert refused.reason is Reason.PRIOR_TOO_WIDE
+    assert not asked
+
+
+def test_surface_that_is_too_large_to_read_leaves_the_network(
+    setting: Setting, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def too_large(*_: object) -> None:
+        raise WindowTooLargeError("DSM window of 9000 x 9000 px")
+
+    monkeypatch.setattr(setting.store, "read_surface", too_large)
+    frame, prior = rendered.frame(NADIR, CAMERA), rendered.prior(NADIR)
+    assert not assert_near(setting.localize(frame, prior), NADIR).stored_features
+    refused = setting.localize(frame, prior, precomputed_features="require")
+    assert isinstance(refused, Rejected)
+    assert refused.reason is Reason.PRIOR_TOO_WIDE
 
 
 def test_without_features_there_the_network_looks_at_the_map(setting: Setting) -> None:

@@ -233,6 +233,18 @@ def test_features_of_a_region_over_tile_borders(pack_path: Path) -> None:
         assert (u < index.grids[3].width).all()
 
 
+def test_no_file_is_opened_once_features_are_loaded(pack_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    features._codec.cache_clear()
+    with MapStore(Pack.open(pack_path), features=True) as store:
+        index = FeatureIndex(store, Dots())
+
+        def refuse(*_: object) -> None:
+            raise OSError("a file was opened in flight")
+
+        monkeypatch.setattr(features.resources, "files", refuse)
+        assert len(index.read(store.bounds, 1).descriptors()) > 4
+
+
 def test_scale_that_fits(pack_path: Path) -> None:
     with MapStore(Pack.open(pack_path), features=True) as store:
         index = FeatureIndex(store, Dots())
@@ -281,8 +293,10 @@ def test_damaged_feature_files_are_no_features(pack_path: Path, tmp_path: Path, 
         lambda data: data.replace(b"'<u2'", b"'<i2'"),
         lambda data: data[:128] + data[128:][::-1],
         lambda data: b"\x93NUMPY\x02" + data[7:],
+        lambda data: data.replace(b"{'descr'", b"{('desc'"),
+        lambda data: data.replace(b"False", b"0 0 1"),
     ],
-    ids=["empty", "head", "half", "type", "order", "version"],
+    ids=["empty", "head", "half", "type", "order", "version", "bracket", "syntax"],
 )
 def test_files_that_are_listed_but_no_features_are_named(pack_path: Path, tmp_path: Path, spoil) -> None:
     manifest = Pack.open(pack_path).manifest
