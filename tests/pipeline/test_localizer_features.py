@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -21,10 +21,14 @@ from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.matching.types import Features
 from ortholoc_edge.matching.xfeat import XFeatMatcher
 from ortholoc_edge.pipeline.frame import Frame
+from ortholoc_edge.pipeline.gate import GateOptions
 from ortholoc_edge.pipeline.localizer import Localizer, LocalizerOptions
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.prior import PosePrior, RegionPrior
 from ortholoc_edge.pipeline.rectify import rectified
+from ortholoc_edge.pipeline.rounds import Round
+from ortholoc_edge.pipeline.stored import Attempt, StoredMatching
+from ortholoc_edge.pipeline.trace import Trace
 from ortholoc_edge.tiles import features
 from ortholoc_edge.tiles.manifest import MANIFEST_NAME, FeatureLayer, FeatureTile, write_manifest
 from ortholoc_edge.tiles.pack import Pack
@@ -152,6 +156,31 @@ def test_looking_again_doubles_the_inliers(setting: Setting) -> None:
     # Pairs that a pose picked agree with it: their share says nothing of how good the match was.
     assert twice.inliers / twice.matches > 1.1 * once.quality
     assert twice.quality == once.quality
+
+
+def test_inliers_that_only_looking_again_finds_must_be_many(setting: Setting, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Around a wrong pose it finds some that agree, too."""
+    frame, prior = rendered.frame(NADIR, CAMERA), rendered.prior(NADIR)
+    once = assert_near(setting.localize(frame, prior, precomputed_features="require", adhop=False), NADIR)
+    limits = GateOptions(min_inliers=round(1.2 * once.inliers))
+    assert_near(setting.localize(frame, prior, precomputed_features="require", gate=limits), NADIR)
+    look_again, kept = StoredMatching.looked_again, round(1.5 * limits.min_inliers)
+
+    def fewer(self: StoredMatching, attempt: Attempt, trace: Trace) -> Round:
+        found = look_again(self, attempt, trace)
+        assert found is not None
+        assert found.estimate is not None
+        inliers = np.zeros(len(found.kept), bool)
+        agreeing = np.flatnonzero(found.estimate.inliers)
+        inliers[agreeing[np.linspace(0, len(agreeing) - 1, kept).astype(int)]] = True
+        return replace(found, estimate=replace(found.estimate, inliers=inliers))
+
+    monkeypatch.setattr(StoredMatching, "looked_again", fewer)
+    refused = setting.localize(frame, prior, precomputed_features="require", gate=limits)
+    assert isinstance(refused, Rejected)
+    assert (refused.reason, refused.measured, refused.limit) == (Reason.FEW_INLIERS, kept, 2 * limits.min_inliers)
+    passed = setting.localize(frame, prior, precomputed_features="require", gate=GateOptions(min_inliers=20))
+    assert assert_near(passed, NADIR).inliers == kept
 
 
 def test_tilt_and_lens_distortion(setting: Setting) -> None:
