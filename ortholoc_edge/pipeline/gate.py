@@ -121,7 +121,8 @@ def certain(covariance: FloatArray, height_above_ground_m: float, options: GateO
     """A pose that says of itself that it may be anywhere is no help to a filter."""
     sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
     limit = options.max_relative_sigma * height_above_ground_m
-    if sigma > limit:
+    # Of an infinite covariance (a map whose stated sigma is absurd) it is NaN.
+    if not sigma <= limit:
         return Refusal(Reason.UNCERTAIN, "1-sigma of position along its worst axis, m", sigma, limit)
     return None
 

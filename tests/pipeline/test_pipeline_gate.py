@@ -180,6 +180,11 @@ def test_an_uncertain_estimate_is_given_the_benefit_of_its_own_covariance():
     assert gate.agrees_with(PRIOR, pose, covariance(3.0), OPTIONS) is None
 
 
+def test_an_infinite_covariance_is_uncertain():
+    refusal = gate.certain(np.diag([np.inf, np.inf, 0.01, 1e-4, 1e-4, 1e-4]), 100.0, OPTIONS)
+    assert refusal.reason is Reason.UNCERTAIN
+
+
 def test_refusals_are_plain_numbers():
     for _, changes, *_ in TABLE:
         refusal = gate.check(**case(**changes))
