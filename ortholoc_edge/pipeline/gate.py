@@ -119,10 +119,11 @@ def above_ground(height_above_ground_m: float) -> Refusal | None:
 
 def certain(covariance: FloatArray, height_above_ground_m: float, options: GateOptions) -> Refusal | None:
     """A pose that says of itself that it may be anywhere is no help to a filter."""
-    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+    # A map whose stated sigma is absurd makes it infinite, which has no eigenvalues.
+    known = bool(np.isfinite(covariance).all())
+    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])) if known else math.inf
     limit = options.max_relative_sigma * height_above_ground_m
-    # Of an infinite covariance (a map whose stated sigma is absurd) it is NaN.
-    if not sigma <= limit:
+    if sigma > limit:
         return Refusal(Reason.UNCERTAIN, "1-sigma of position along its worst axis, m", sigma, limit)
     return None
 
