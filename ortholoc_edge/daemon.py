@@ -284,7 +284,9 @@ class Daemon:
     def _warm_up(self) -> None:
         """The first inference allocates and compiles; it must not happen in flight."""
         camera = self._config.intrinsics.camera()
-        self._matcher.extract(np.zeros((camera.height, camera.width), np.uint8))
+        # Noise, because of an even picture no matcher asks its network.
+        picture = np.random.default_rng(0).integers(0, 256, (camera.height, camera.width), dtype=np.uint8)
+        self._matcher.extract(picture)
 
     # -- one frame -------------------------------------------------------------------------------------
 

@@ -59,6 +59,8 @@ _NAVD88_SIGMA_M = 2.0
 _AREA_MARGIN_DEG = 0.5
 
 VerticalKind = Literal["ellipsoid", "orthometric", "unknown"]
+# Between a sea level and the ellipsoid, with room for national zeros: more is a mistake or an attack.
+HeightOffset = Annotated[float, msgspec.Meta(ge=-150, le=150)]
 
 
 class VerticalDatum(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -82,10 +84,10 @@ class VerticalDatum(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     kind: VerticalKind
     name: str | None = None
     epsg: int | None = None
-    amsl_minus_map_m: float | None = None
-    ellipsoid_minus_map_m: float | None = None
+    amsl_minus_map_m: HeightOffset | None = None
+    ellipsoid_minus_map_m: HeightOffset | None = None
     derivation: str | None = None
-    amsl_sigma_m: Annotated[float, msgspec.Meta(ge=0)] | None = None
+    amsl_sigma_m: Annotated[float, msgspec.Meta(ge=0, le=1000)] | None = None
 
     def amsl_from_map(self, height_map_m: float) -> float:
         """Height above mean sea level (EGM96), m. Raises: MapError where the pack does not say."""

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from ortholoc_edge.errors import MapError
-from ortholoc_edge.tiles.georeference import VerticalDatum
+from ortholoc_edge.tiles.georeference import HeightOffset, VerticalDatum
 from ortholoc_edge.tiles.lattice import CROP_PX, Bounds, Lattice, PixelBox
 
 MANIFEST_NAME = "manifest.json"
@@ -23,7 +23,9 @@ _T = TypeVar("_T", bound=msgspec.Struct)
 
 _Bytes = Annotated[int, msgspec.Meta(ge=0)]
 _Positive = Annotated[float, msgspec.Meta(gt=0)]
-_Sigma = Annotated[float, msgspec.Meta(ge=0)]
+# Beyond these a number is a mistake or an attack, and the offsets go to the autopilot.
+_Sigma = Annotated[float, msgspec.Meta(ge=0, le=1000)]
+_Height = Annotated[float, msgspec.Meta(ge=-12_000, le=12_000)]
 _Fraction = Annotated[float, msgspec.Meta(ge=0, le=1)]
 _Px = Annotated[int, msgspec.Meta(ge=0, multiple_of=CROP_PX)]
 _SidePx = Annotated[int, msgspec.Meta(ge=CROP_PX, multiple_of=CROP_PX)]
@@ -85,11 +87,11 @@ class DsmTile(Tile, frozen=True, forbid_unknown_fields=True, kw_only=True):
         amsl_minus_map_m, ellipsoid_minus_map_m: as in `VerticalDatum`, at the tile's centre.
     """
 
-    min_m: float
-    max_m: float
+    min_m: _Height
+    max_m: _Height
     filled_fraction: _Fraction = 0.0
-    amsl_minus_map_m: float | None = None
-    ellipsoid_minus_map_m: float | None = None
+    amsl_minus_map_m: HeightOffset | None = None
+    ellipsoid_minus_map_m: HeightOffset | None = None
 
 
 class SourceNote(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
