@@ -119,7 +119,7 @@ class PackOptions:
     """
 
     dop_compression: encode.Compression = "webp"
-    quality: int = 75
+    quality: int = 85
     max_z_error_m: float | None = None
     dop_gsd_m: float | None = None
     dsm_gsd_m: float | None = None

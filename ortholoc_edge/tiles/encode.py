@@ -33,7 +33,7 @@ def dop_cog(
     grid: RasterGrid,
     crs: str | None,
     compression: Compression = "webp",
-    quality: int = 75,
+    quality: int = 85,
 ) -> bytes:
     """Orthophoto (3, H, W) uint8 with its validity (H, W) as an internal mask; sides are multiples of 16.
 

@@ -104,7 +104,7 @@ def test_manifest_tells_what_was_stated(scene, tmp_path):
     assert (manifest.dop.date, manifest.dsm.date) == ("2023-06-04", "2021")
     assert (manifest.dop.attribution, manifest.dsm.licence) == ("© Someone", "dl-de/by-2-0")
     assert (manifest.dop.true_ortho, manifest.dop.sigma_m, manifest.dsm.sigma_m) == (False, 0.2, 0.3)
-    assert manifest.dop.compression == "JPEG quality 75"
+    assert manifest.dop.compression == "JPEG quality 85"
     assert (manifest.dsm.max_z_error_m, manifest.dsm.nodata) == (0.05, -9999.0)
     assert manifest.vertical.amsl_minus_map_m == -46.0
     assert (manifest.dop.gsd_m, manifest.dsm.gsd_m) == (0.1, 0.2)

@@ -34,7 +34,7 @@ def test_build_info_verify(scene, tmp_path, capsys, monkeypatch):
 
     assert run("info", out) == 0
     table = capsys.readouterr().out
-    for text in ("2023-11-14T22:13:20Z", "WEBP quality 75", "0.01 m by compression", "2023-06", "5 levels"):
+    for text in ("2023-11-14T22:13:20Z", "WEBP quality 85", "0.01 m by compression", "2023-06", "5 levels"):
         assert text in table
     assert run("verify", out) == 0
     assert "sound" in capsys.readouterr().out
