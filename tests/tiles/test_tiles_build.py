@@ -203,13 +203,13 @@ def test_interrupted_build_leaves_the_old_pack_and_its_work(scene, tmp_path, at)
 def test_full_disk_is_a_map_error(scene, tmp_path, limit_bytes, kept):
     """RLIMIT_FSIZE makes the kernel refuse real writes, as a full disk does: of the DOP's tile, of the DSM's."""
     out = tmp_path / "pack"
-    old = built(*scene, out)
+    old = built(*scene, out, quality=75)
     before = contents(out)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, limits[1]))
     try:
         with pytest.raises(MapError, match=r"cannot be written \(File too large\); check free space"):
-            built(*scene, out, force=True)
+            built(*scene, out, quality=75, force=True)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert contents(out) == before
