@@ -411,17 +411,6 @@ def vertical_of(crs: str, what: str) -> tuple[VerticalKind, int | None] | None:
     return None
 
 
-def derive_vertical(
-    kind: VerticalKind,
-    epsg: int | None,
-    geoid_undulation_m: float | None,
-    lat_lon_deg: tuple[float, float] | None,
-) -> VerticalDatum:
-    """`derive_offsets` at one place; None for a local frame, where PROJ cannot help."""
-    places = None if lat_lon_deg is None else np.array([lat_lon_deg])
-    return derive_offsets(kind, epsg, geoid_undulation_m, places)[0]
-
-
 def derive_offsets(
     kind: VerticalKind,
     epsg: int | None,

@@ -22,7 +22,6 @@ from ortholoc_edge.tiles.georeference import (
     VerticalDatum,
     datum_shift_caveat,
     derive_offsets,
-    derive_vertical,
 )
 
 ELLIPSOIDAL = VerticalDatum(kind="ellipsoid", ellipsoid_minus_map_m=0.0, amsl_minus_map_m=-47.5)
@@ -44,6 +43,11 @@ PLACES = [
     ("EPSG:3413", 75.0, -20.0),
     ("EPSG:25832", 54.5, 8.5),
 ]
+
+
+def derive_vertical(kind, epsg, undulation_m, place):
+    """The datum at one place."""
+    return derive_offsets(kind, epsg, undulation_m, None if place is None else [place])[0]
 
 
 def georeference(crs, lat, lon, vertical=ELLIPSOIDAL):
@@ -275,7 +279,11 @@ def test_geoid_grid_is_used_where_proj_has_it(tmp_path):
     import numpy as np, pyproj.datadir, rasterio
     from affine import Affine
     from ortholoc_edge.errors import ConfigError
-    from ortholoc_edge.tiles.georeference import derive_offsets, derive_vertical
+    from ortholoc_edge.tiles.georeference import derive_offsets
+
+    def derive_vertical(kind, epsg, undulation_m, place):
+        return derive_offsets(kind, epsg, undulation_m, [place])[0]
+
     profile = dict(driver="GTiff", width=13, height=13, count=1, dtype="float32", crs="EPSG:4326",
                    transform=Affine(.25, 0, 8.375, 0, -.25, 49.625))
     with rasterio.open(r"{tmp_path}/us_nga_egm96_15.tif", "w", **profile) as grid:
