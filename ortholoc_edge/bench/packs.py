@@ -50,16 +50,21 @@ class Variant:
 
 
 def variants(
-    qualities: Sequence[int], jpeg: Sequence[int], z_errors_m: Sequence[float], features: Sequence[float], matcher: str
+    qualities: Sequence[int],
+    jpeg: Sequence[int],
+    z_errors_m: Sequence[float],
+    features: Sequence[float],
+    matcher: str,
+    quality: int = PackOptions().quality,
 ) -> list[Variant]:
     """The reference first: lossless DOP, DSM to a tenth of a millimetre. Then one thing at a time is changed.
 
     Args:
         qualities, jpeg: of WEBP and JPEG, with the builder's own DSM error.
-        z_errors_m: with the builder's own quality.
-        features: per million pixels, precomputed for ``matcher``, with the builder's own quality.
+        z_errors_m: with WEBP of ``quality``.
+        features: per million pixels, precomputed for ``matcher``, with WEBP of ``quality``.
     """
-    plain = PackOptions(vertical="unknown", max_z_error_m=0.05)
+    plain = PackOptions(vertical="unknown", max_z_error_m=0.05, quality=quality)
     found = [Variant("reference: lossless, 0.1 mm", replace(plain, quality=100, max_z_error_m=1e-4))]
     found += [Variant(f"WEBP {q}, DSM 5 cm", replace(plain, quality=q)) for q in qualities]
     found += [Variant(f"JPEG {q}, DSM 5 cm", replace(plain, quality=q, dop_compression="jpeg")) for q in jpeg]

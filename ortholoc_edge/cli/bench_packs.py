@@ -70,6 +70,12 @@ def _add_size(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         metavar="N",
         help="precomputed per million pixels (default: %(default)s)",
     )
+    size.add_argument(
+        "--quality",
+        type=int,
+        default=PackOptions().quality,
+        help="WEBP of the rows that vary DSM error and features (default: %(default)s)",
+    )
     size.add_argument("--matcher", choices=MATCHERS, default="xfeat", help="(default: %(default)s)")
     size.add_argument(
         "--prior", choices=[str(k) for k in PriorKind], default=str(PriorKind.ODOMETER), help="(default: %(default)s)"
@@ -157,7 +163,7 @@ def _processor() -> str:
 
 
 def _size(args: argparse.Namespace) -> int:
-    chosen = packs.variants(args.webp, args.jpeg, args.z_error, args.features, args.matcher)
+    chosen = packs.variants(args.webp, args.jpeg, args.z_error, args.features, args.matcher, args.quality)
     with ProgressBar(f"model {args.matcher}") as bar:
         matcher = make_matcher(args.matcher, working_px=640, max_keypoints=4096, threads=1, progress=bar.step)
     found: dict[str, list[packs.Measured]] = {}

@@ -64,7 +64,7 @@ def test_a_row_compares_frame_by_frame_with_the_reference() -> None:
 
 
 def test_variants_change_one_thing_and_the_reference_is_lossless() -> None:
-    chosen = packs.variants([90, 75], [75], [0.02, 0.1], [1000.0], "xfeat")
+    chosen = packs.variants([90, 75], [75], [0.05, 0.1], [1000.0], "xfeat", 75)
     assert chosen[0].options.quality == 100
     assert chosen[0].options.max_z_error_m == 1e-4
     assert len({v.name for v in chosen}) == len(chosen) == 6

@@ -30,7 +30,7 @@ def expected(wide_scene, tmp_path_factory):
     """What an uninterrupted build in one process gives, by quality."""
     made = {}
 
-    def get(quality=75):
+    def get(quality=85):
         if quality not in made:
             out = tmp_path_factory.mktemp("expected") / "pack"
             made[quality] = contents(built(wide_scene, out, quality=quality).path)
