@@ -31,8 +31,8 @@ from ortholoc_edge.tiles.manifest import FeatureTile
 from ortholoc_edge.tiles.store import MapStore
 
 MATCHERS: Final = ("xfeat",)
-# Names the principal axes of `data/xfeat_basis.npz`, how many bits each has, and the scales: raise the last number
-# when one of them changes.
+# Names the principal axes of `data/xfeat_basis.npz` (made by tests/tiles/make_xfeat_basis.py), how many bits each has,
+# and the scales: raise the last number when one of them changes.
 ENCODING: Final = "xfeat-pca64-1"
 # What the builder's matcher is made with. Windows have this side, so that nothing is scaled.
 WORKING_PX: Final = 640
