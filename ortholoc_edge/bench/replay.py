@@ -26,9 +26,10 @@ from ortholoc_edge.pipeline.frame import Frame, VehicleState
 from ortholoc_edge.pipeline.localizer import Localizer
 from ortholoc_edge.pipeline.navigator import Navigator
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
-from ortholoc_edge.pipeline.prior import Bounds, PosePrior, RegionPrior, footprint
+from ortholoc_edge.pipeline.prior import PosePrior, RegionPrior, footprint
 from ortholoc_edge.pipeline.tracker import Tracker, TrackerOptions
 from ortholoc_edge.tiles.georeference import Georeference
+from ortholoc_edge.tiles.lattice import Bounds
 
 # Paper, appendix "Data Pairing": each side of the region is moved by up to 20 m.
 _REGION_MARGIN_M = 20.0

@@ -27,7 +27,6 @@ from ortholoc_edge.pipeline.precondition import ReferenceView
 from ortholoc_edge.pipeline.prior import (
     MAX_HYPOTHESES,
     MAX_RANGE_HEIGHTS,
-    Bounds,
     PosePrior,
     RegionPrior,
     footprint,
@@ -41,6 +40,7 @@ from ortholoc_edge.pose import calibrate, pnp
 from ortholoc_edge.pose.lift import lift
 from ortholoc_edge.tiles.features import FeatureIndex
 from ortholoc_edge.tiles.georeference import LocalFrame
+from ortholoc_edge.tiles.lattice import Bounds
 from ortholoc_edge.tiles.manifest import Manifest
 from ortholoc_edge.tiles.store import MapStore, WindowTooLargeError
 from ortholoc_edge.tiles.window import MapWindow

@@ -11,8 +11,7 @@ from ortholoc_edge.geometry.arrays import FloatArray, frozen_floats
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.covariance import mahalanobis_squared
 from ortholoc_edge.geometry.rigid import Rigid3
-
-Bounds = tuple[float, float, float, float]
+from ortholoc_edge.tiles.lattice import Bounds
 
 # Rays that meet the ground farther off than this many heights show pixels too coarse to match
 # (field-notes "Oblique views": mask what is beyond ten times the ground sampling distance at nadir).

@@ -22,12 +22,13 @@ from ortholoc_edge.matching.nearest import mutual_nearest
 from ortholoc_edge.matching.types import Matches, UnscaledMatcher
 from ortholoc_edge.pipeline import precondition
 from ortholoc_edge.pipeline.outcome import Reason
-from ortholoc_edge.pipeline.prior import Bounds, PosePrior
+from ortholoc_edge.pipeline.prior import PosePrior
 from ortholoc_edge.pipeline.rectify import RectifiedFrame, rectified
 from ortholoc_edge.pipeline.rounds import RejectedError, Round, Scene
 from ortholoc_edge.pipeline.trace import Trace
 from ortholoc_edge.pose.lift import lift
 from ortholoc_edge.tiles.features import FeatureIndex, StoredFeatures
+from ortholoc_edge.tiles.lattice import Bounds
 from ortholoc_edge.tiles.store import MapStore, WindowTooLargeError
 from ortholoc_edge.tiles.window import SurfaceWindow
 

@@ -33,7 +33,7 @@ from ortholoc_edge.tiles.georeference import (
     derive_offsets,
 )
 from ortholoc_edge.tiles.install import install, work_folder
-from ortholoc_edge.tiles.lattice import CROP_PX, Lattice, PixelBox
+from ortholoc_edge.tiles.lattice import CROP_PX, Lattice, PixelBox, meeting
 from ortholoc_edge.tiles.manifest import (
     FORMAT,
     MANIFEST_NAME,
@@ -745,7 +745,7 @@ class _Build:
         dsm = [
             tile
             for tile in manifest.dsm.tiles
-            if any(_touch(manifest.dsm.lattice.grid(tile.box).bounds, box) for box in boxes)
+            if any(meeting(manifest.dsm.lattice.grid(tile.box).bounds, box) for box in boxes)
         ]
         if not dsm:
             return None
@@ -802,10 +802,6 @@ def _anchor(lattice: Lattice, box: PixelBox) -> tuple[float, float]:
 
 def _cells(tile: DopTile | DsmTile, data: bytes) -> np.ndarray:
     return np.frombuffer(data, np.uint8).reshape(tile.height // CROP_PX, tile.width // CROP_PX)
-
-
-def _touch(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:
-    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
 def _groups(dop: Dop) -> list[DopTile]:

@@ -108,3 +108,9 @@ class Lattice(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         side = self.tile_px * self.pixel_m
         east, north = self.west + column * side, self.top - (row + 1) * side
         return f"{math.floor(east + _SLACK_PX)}_{math.floor(north + _SLACK_PX)}"
+
+
+def meeting(a: Bounds, b: Bounds) -> Bounds | None:
+    """What two boxes share; None if they do not overlap, or only touch."""
+    box = max(a[0], b[0]), max(a[1], b[1]), min(a[2], b[2]), min(a[3], b[3])
+    return box if box[0] < box[2] and box[1] < box[3] else None

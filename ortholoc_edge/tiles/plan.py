@@ -16,7 +16,7 @@ from ortholoc_edge.errors import ConfigError, MapError
 from ortholoc_edge.geometry.grid import RasterGrid
 from ortholoc_edge.tiles.area import Area, MapArea
 from ortholoc_edge.tiles.georeference import Georeference, VerticalDatum, VerticalKind, projected_crs
-from ortholoc_edge.tiles.lattice import Bounds, Lattice, PixelBox
+from ortholoc_edge.tiles.lattice import Bounds, Lattice, PixelBox, meeting
 from ortholoc_edge.tiles.resample import same_crs
 from ortholoc_edge.tiles.sources import Source, is_copied, transform_caveat
 
@@ -108,17 +108,17 @@ def make_plan(
     _warn_of_rough_ways([*dop, *dsm], crs)
     dop_bounds, dsm_bounds = ([bounds_in(source, crs) for source in layer] for layer in (dop, dsm))
     _check_overlap(dop, dop_bounds, dsm, dsm_bounds)
-    shared = _meeting(_union(dop_bounds), _union(dsm_bounds))
+    shared = meeting(_union(dop_bounds), _union(dsm_bounds))
     assert shared is not None, "checked"
     if map_area is not None:
-        inside = _meeting(shared, map_area.bounds)
+        inside = meeting(shared, map_area.bounds)
         if inside is None:
             raise ConfigError(
                 f"--area covers {_rounded(map_area.bounds)} of {crs or 'the map'}, the sources {_rounded(shared)};"
                 " they do not meet, choose another area or other sources"
             )
         shared = inside
-    asked = _union(dop_bounds) if map_area is None else _meeting(_union(dop_bounds), map_area.bounds)
+    asked = _union(dop_bounds) if map_area is None else meeting(_union(dop_bounds), map_area.bounds)
     assert asked is not None, "it holds what is shared"
     share = _area_m2(shared) / _area_m2(asked)
     if share < _SPARSE_COVERAGE:
@@ -262,7 +262,7 @@ def _under(boxes: Sequence[Bounds], lattice: Lattice, frame: Bounds) -> dict[tup
     what meets, not of all boxes times all tiles: a state has 50,000 of each."""
     met: dict[tuple[int, int], list[int]] = defaultdict(list)
     for index, bounds in enumerate(boxes):
-        inside = _meeting(bounds, frame)
+        inside = meeting(bounds, frame)
         if inside is not None:
             for part in lattice.tiles(lattice.box(inside)):
                 met[lattice.tile_key(part.column, part.row)].append(index)
@@ -301,7 +301,7 @@ def _round_size(grid: RasterGrid) -> float:
 def _check_overlap(
     dop: Sequence[Source], dop_bounds: Sequence[Bounds], dsm: Sequence[Source], dsm_bounds: Sequence[Bounds]
 ) -> None:
-    if any(_meeting(a, b) is not None for a in dop_bounds for b in dsm_bounds):
+    if any(meeting(a, b) is not None for a in dop_bounds for b in dsm_bounds):
         return
     raise MapError(
         f"{dsm[0].name}{' and others' if len(dsm) > 1 else ''}: covers west, south, east, north"
@@ -313,11 +313,6 @@ def _check_overlap(
 def _union(boxes: Sequence[Bounds]) -> Bounds:
     west, south, east, north = zip(*boxes, strict=True)
     return min(west), min(south), max(east), max(north)
-
-
-def _meeting(a: Bounds, b: Bounds) -> Bounds | None:
-    box = max(a[0], b[0]), max(a[1], b[1]), min(a[2], b[2]), min(a[3], b[3])
-    return box if box[0] < box[2] and box[1] < box[3] else None
 
 
 def _rounded(bounds: Bounds) -> tuple[float, ...]:
