@@ -41,12 +41,12 @@ _TREE_CELL_M = 4.8
 Colour = tuple[int, int, int]
 
 # Forms of land between the net's edges.
-_FIELDS, _VILLAGE, _FOREST = range(3)
+FIELDS, VILLAGE, FOREST = range(3)
 # Around the centre something of everything, so that the smallest area has it too.
-_FIXED_USE = {(0, 0): _VILLAGE, (-1, 0): _FIELDS, (-1, -1): _FOREST, (0, -1): _FIELDS}
+_FIXED_USE = {(0, 0): VILLAGE, (-1, 0): FIELDS, (-1, -1): FOREST, (0, -1): FIELDS}
 # Kinds of the net's edges.
-_HEDGE, _TRACK, _ROAD, _HIGHWAY = range(4)
-_EDGE_WIDTH_M = {_HEDGE: 1.5, _TRACK: 3.2, _ROAD: 5.5, _HIGHWAY: 8.0}
+HEDGE, TRACK, ROAD, HIGHWAY = range(4)
+EDGE_WIDTH_M = {HEDGE: 1.5, TRACK: 3.2, ROAD: 5.5, HIGHWAY: 8.0}
 
 _ROOFS: tuple[Colour, ...] = (
     (152, 82, 62), (138, 70, 54), (166, 98, 72), (120, 66, 56), (92, 90, 92), (108, 106, 106), (84, 76, 74)
@@ -146,7 +146,7 @@ class _Trees:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Plot:
+class Plot:
     """What the net's cell (i, j) holds, at all times."""
 
     outline: FloatArray
@@ -245,7 +245,7 @@ class Country:
         solved = np.linalg.lstsq(design, world, rcond=None)[0]
         return View(grid.width, grid.height, np.asarray(solved.T, dtype=np.float64))
 
-    def plots(self, low: FloatArray, high: FloatArray) -> Iterator[_Plot]:
+    def plots(self, low: FloatArray, high: FloatArray) -> Iterator[Plot]:
         """Plots that may touch a box, in an order that does not depend on it."""
         first = np.floor((low - CENTRE) / _NET_M).astype(int) - 1
         last = np.floor((high - CENTRE) / _NET_M).astype(int) + 1
@@ -254,6 +254,26 @@ class Country:
                 plot = _plot(self.seed, i, j)
                 if (plot.high > low).all() and (plot.low < high).all():
                     yield plot
+
+    def edges(self, low: FloatArray, high: FloatArray) -> list[tuple[int, FloatArray]]:
+        """Kind (`HEDGE` to `HIGHWAY`) and line (9, 2) of the net's edges that may touch a box, the important last."""
+        first = np.floor((low - CENTRE) / _NET_M).astype(int) - 1
+        last = np.floor((high - CENTRE) / _NET_M).astype(int) + 1
+        found = [
+            _edge(self.seed, int(i), int(j), north)
+            for j in range(first[1], last[1] + 1)
+            for i in range(first[0], last[0] + 1)
+            for north in (False, True)
+        ]
+        return sorted(found, key=lambda one: one[0])
+
+    def lakes(self, low: FloatArray, high: FloatArray) -> list[_Lake]:
+        """Lakes that may touch a box."""
+        return list(_lakes(self.seed, low, high))
+
+    def ground(self, xy: FloatArray) -> FloatArray:
+        """(N,) heights m of the bare ground at points (N, 2) of `FRAME`."""
+        return _terrain(self.seed, xy, self.lakes(xy.min(axis=0), xy.max(axis=0)))
 
 
 def hole_mask(country: Country, grid: RasterGrid, crs: str) -> BoolArray:
@@ -407,31 +427,31 @@ def _edge(seed: int, i: int, j: int, north: bool) -> tuple[int, FloatArray]:
     line = a + along * t + bend * 4 * t * (1 - t) * np.array([-along[1], along[0]])
     chance = _cell(seed, i, j, salt + 4)
     if (i if north else j) % 6 == 0:
-        return _HIGHWAY, line
-    return (_ROAD if chance < 0.30 else _TRACK if chance < 0.72 else _HEDGE), line
+        return HIGHWAY, line
+    return (ROAD if chance < 0.30 else TRACK if chance < 0.72 else HEDGE), line
 
 
 @lru_cache(maxsize=1024)
-def _plot(seed: int, i: int, j: int) -> _Plot:
+def _plot(seed: int, i: int, j: int) -> Plot:
     south, north = _edge(seed, i, j, False)[1], _edge(seed, i, j + 1, False)[1]
     west, east = _edge(seed, i, j, True)[1], _edge(seed, i + 1, j, True)[1]
     patch = _Patch(south, north, west, east)
     outline = np.concatenate([south[:-1], east[:-1], north[:0:-1], west[:0:-1]])
     land = float(_smooth(seed, outline.mean(axis=0)[None], 2.2 * _NET_M, 9)[0])
-    use = _FIXED_USE.get((i, j), _FOREST if land < -0.85 else _VILLAGE if land > 1.15 else _FIELDS)
+    use = _FIXED_USE.get((i, j), FOREST if land < -0.85 else VILLAGE if land > 1.15 else FIELDS)
     rng = _random(seed, i, j, 10)
     fields: list[_Field] = []
     streets: list[FloatArray] = []
     houses: list[_House] = []
-    if use == _FIELDS:
+    if use == FIELDS:
         fields = _sown(patch, rng, (i * 4096 + j) * 64)
-    elif use == _VILLAGE:
+    elif use == VILLAGE:
         fields, streets, houses = _village(patch, rng, (i * 4096 + j) * 64)
-    if use == _FIELDS and rng.random() < 0.35:
+    if use == FIELDS and rng.random() < 0.35:
         houses = [_hall(patch, rng)]
     trees = _planted(seed, i, j, use, patch, outline, houses, rng)
     low, high = outline.min(axis=0) - 12.0, outline.max(axis=0) + 12.0
-    return _Plot(outline, use, tuple(fields), tuple(streets), tuple(houses), trees, low, high)
+    return Plot(outline, use, tuple(fields), tuple(streets), tuple(houses), trees, low, high)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -558,7 +578,7 @@ def _planted(
     rng: np.random.Generator,
 ) -> _Trees:
     spots: list[FloatArray] = []
-    if use == _FOREST:
+    if use == FOREST:
         low = np.floor((outline.min(axis=0) - CENTRE) / _TREE_CELL_M).astype(int)
         high = np.ceil((outline.max(axis=0) - CENTRE) / _TREE_CELL_M).astype(int)
         rows, columns = np.meshgrid(np.arange(high[1], low[1], -1), np.arange(low[0], high[0]), indexing="ij")
@@ -568,23 +588,23 @@ def _planted(
         clearing = _smooth(seed, xy, 55.0, 13) > 1.5
         spots.append(xy[_inside(xy, outline, 3.5) & ~clearing])
     else:
-        count = int(rng.integers(90, 160)) if use == _VILLAGE else int(rng.integers(0, 7))
+        count = int(rng.integers(90, 160)) if use == VILLAGE else int(rng.integers(0, 7))
         xy = patch.at(rng.uniform(0.02, 0.98, count), rng.uniform(0.02, 0.98, count))
         for house in houses:
             xy = xy[np.linalg.norm(xy - house.centre, axis=1) > 0.62 * house.length_m]
         spots.append(xy)
     for north in (False, True):  # the edges to the south and to the west are this plot's
         kind, line = _edge(seed, i, j, north)
-        if kind == _HEDGE or (kind == _HIGHWAY and _cell(seed, i, j, 14) < 0.4):
+        if kind == HEDGE or (kind == HIGHWAY and _cell(seed, i, j, 14) < 0.4):
             length = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())
-            t = np.arange(0.04, 0.96, (3.4 if kind == _HEDGE else 11.0) / length)
-            offset = np.where(rng.random(len(t)) < 0.5, 1.0, -1.0) * (6.5 if kind == _HIGHWAY else 0.0)
+            t = np.arange(0.04, 0.96, (3.4 if kind == HEDGE else 11.0) / length)
+            offset = np.where(rng.random(len(t)) < 0.5, 1.0, -1.0) * (6.5 if kind == HIGHWAY else 0.0)
             normal = np.array([-(line[-1] - line[0])[1], (line[-1] - line[0])[0]]) / length
             row = _along(line, t) + rng.normal(0, 0.9, (len(t), 2)) + offset[:, None] * normal
             spots.append(row[rng.random(len(t)) < 0.75])
     xy = np.concatenate(spots)
     count = len(xy)
-    if use == _FOREST:
+    if use == FOREST:
         needles = (_smooth(seed, xy, 120.0, 15) + rng.normal(0, 0.35, count) > 0.1).astype(np.int64)
         radius = np.where(needles == 1, rng.uniform(1.8, 2.8, count), rng.uniform(2.1, 3.9, count))
         height = rng.uniform(13, 22, count) + 3.0 * _smooth(seed, xy, 70.0, 16)
@@ -672,7 +692,8 @@ class _Painter:
         self.seed, self.view, self.look = country.seed, view, look
         low, high = view.box(_REACH_M)
         self.plots = list(country.plots(low, high))
-        self.lakes = list(_lakes(country.seed, low, high))
+        self.lakes = country.lakes(low, high)
+        self.edges = country.edges(low, high)
         self.scale = view.px_per_m
         azimuth, elevation = np.radians([look.sun_azimuth_deg, look.sun_elevation_deg])
         # Metres a shadow reaches, per metre of height.
@@ -709,8 +730,8 @@ class _Painter:
             for sown in plot.fields:
                 if not sown.garden:
                     cv2.fillPoly(above, [self._fixed(sown.outline)], self._crop(sown)[1], cv2.LINE_8, _SHIFT)
-        for kind, line in self._edges():
-            self._line(above, line, _EDGE_WIDTH_M[kind], 0.0)
+        for kind, line in self.edges:
+            self._line(above, line, EDGE_WIDTH_M[kind], 0.0)
         for lake in self.lakes:
             cv2.fillPoly(above, [self._fixed(lake.outline)], 0.0, cv2.LINE_8, _SHIFT)
         self._tree_tops(above)
@@ -727,7 +748,7 @@ class _Painter:
         view = self.view
         bank = _noise_bank(self.seed + 3, 1024, 0.7, 40.0)
         for plot in self.plots:
-            if plot.use == _FOREST:
+            if plot.use == FOREST:
                 cv2.fillPoly(canvas, [self._fixed(plot.outline)], (58, 66, 44), cv2.LINE_AA, _SHIFT)
             for sown in plot.fields:
                 px = self._fixed(sown.outline)
@@ -772,38 +793,24 @@ class _Painter:
         colour, height = look.crops[int(chance * len(look.crops))]
         return _toned(colour, 0.9 + 0.2 * _cell(look.seed, sown.ident, 2, 43)), height
 
-    def _edges(self) -> list[tuple[int, FloatArray]]:
-        """Edges of the net that may be seen, the important ones last."""
-        low, high = self.view.box(_REACH_M)
-        first = np.floor((low - CENTRE) / _NET_M).astype(int) - 1
-        last = np.floor((high - CENTRE) / _NET_M).astype(int) + 1
-        found = [
-            _edge(self.seed, int(i), int(j), north)
-            for j in range(first[1], last[1] + 1)
-            for i in range(first[0], last[0] + 1)
-            for north in (False, True)
-        ]
-        return sorted(found, key=lambda one: one[0])
-
     def _ways(self, canvas: ImageArray, rough: npt.NDArray[np.uint8]) -> None:
         look = self.look
         for plot in self.plots:
             for street in plot.streets:
                 self._line(canvas, street, 5.0, look.paved)
                 self._line(rough, street, 5.0, 40)
-        edges = self._edges()
-        for kind, line in edges:
-            self._line(canvas, line, _EDGE_WIDTH_M[kind] + (4.5 if kind >= _ROAD else 1.6), _toned(look.grass, 0.94))
-        for kind, line in edges:
-            if kind == _HEDGE:
+        for kind, line in self.edges:
+            self._line(canvas, line, EDGE_WIDTH_M[kind] + (4.5 if kind >= ROAD else 1.6), _toned(look.grass, 0.94))
+        for kind, line in self.edges:
+            if kind == HEDGE:
                 continue
-            width = _EDGE_WIDTH_M[kind]
-            colour = {_TRACK: (178, 162, 136), _ROAD: look.paved, _HIGHWAY: (116, 116, 118)}[kind]
+            width = EDGE_WIDTH_M[kind]
+            colour = {TRACK: (178, 162, 136), ROAD: look.paved, HIGHWAY: (116, 116, 118)}[kind]
             self._line(canvas, line, width, colour)
-            self._line(rough, line, width, 70 if kind == _TRACK else 34)
-            if kind == _TRACK:
+            self._line(rough, line, width, 70 if kind == TRACK else 34)
+            if kind == TRACK:
                 self._line(canvas, line, 0.9, _toned(look.grass, 0.95))
-            if kind == _HIGHWAY:
+            if kind == HIGHWAY:
                 along = line[-1] - line[0]
                 normal = np.array([-along[1], along[0]]) / np.linalg.norm(along)
                 for side in (-0.43, 0.43):
@@ -866,7 +873,7 @@ class _Painter:
             base = np.array([look.leaves, look.needles])[trees.kind[at]] * tones[:, None]
             dark = (base * 0.74).astype(int).tolist()
             bright = np.minimum(base * 1.18, 255).astype(int).tolist()
-            if plot.use != _FOREST:
+            if plot.use != FOREST:
                 for spot, r in zip(shade, radius, strict=True):
                     cv2.circle(light, spot, r, 128, -1, cv2.LINE_8, _SHIFT)
             for spot, r in zip(centre, radius, strict=True):
@@ -916,7 +923,7 @@ class _Painter:
             px, radius, height = view.px(trees.xy[at]), trees.radius_m[at], trees.height_m[at]
             base = np.round(px).astype(int)
             # Between the crowns of a forest one looks on branches, not on its ground.
-            spread = _FOREST_SPREAD if plot.use == _FOREST else 1.0
+            spread = _FOREST_SPREAD if plot.use == FOREST else 1.0
             reach = int(np.ceil(spread * radius.max() * scale)) + 1
             for dv in range(-reach, reach + 1):
                 for du in range(-reach, reach + 1):
@@ -946,7 +953,7 @@ class _Painter:
 
     # -- tools --
 
-    def _standing(self, plot: _Plot, reach_m: float) -> tuple[_Trees, npt.NDArray[np.intp]]:
+    def _standing(self, plot: Plot, reach_m: float) -> tuple[_Trees, npt.NDArray[np.intp]]:
         """Trees of a plot that this look has and that may reach the block."""
         trees, view = plot.trees, self.view
         px = view.px(trees.xy)

@@ -35,6 +35,9 @@ from ortholoc_sim.epoch import FLIGHT as LIGHT
 from ortholoc_sim.world import Scene, WorldSpec
 
 CAMERA = Camera.from_focal(640, 480, 540.0)
+# Of a flight's table (docs/sequences.md).
+COLUMNS = ("filename", "exif_time", "utm_e", "utm_n", "alt", "qw", "qx", "qy", "qz", "yaw_true_deg", "pitch_deg",
+           "roll_deg", "width", "height", "fx", "fy", "cx", "cy")  # fmt: skip
 _TEXEL_M = 0.2
 _MARGIN_M = 30.0
 _SPEED_M_S = 15.0
@@ -114,8 +117,7 @@ def write_flight(
     before = points_m[0]
     with (out / "generated_flight.csv").open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
-        table.writerow(["filename", "exif_time", "utm_e", "utm_n", "alt", "qw", "qx", "qy", "qz", "yaw_true_deg",
-                        "pitch_deg", "roll_deg", "width", "height", "fx", "fy", "cx", "cy"])  # fmt: skip
+        table.writerow(COLUMNS)
         found = poses(country, georeference, points_m, height_agl_m, seed)
         for k, pose in enumerate(tqdm(found, total=len(points_m), disable=not progress, unit="photo")):
             eye = pose.translation
@@ -123,15 +125,24 @@ def write_flight(
             image = photograph(country, crs, scale, CAMERA, pose, seed=k)
             name = f"photo_{k:04d}.jpg"
             cv2.imwrite(str(out / name), image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
-            attitude = sequence.attitude_of(pose, georeference.convergence_rad(eye[:2]))
-            roll, pitch, yaw = np.degrees(rotation.to_euler(attitude))
             gone_s += float(np.linalg.norm(eye[:2] - before)) / _SPEED_M_S
             before = eye[:2]
             when = start + timedelta(seconds=round(gone_s))
-            quaternion = rotation.to_quaternion(pose.rotation.T)
-            table.writerow([name, when.strftime("%Y:%m:%d %H:%M:%S"), *(f"{v:.4f}" for v in eye),
-                            *(f"{v:.10f}" for v in quaternion), f"{yaw:.6f}", f"{pitch:.6f}", f"{roll:.6f}",
-                            CAMERA.width, CAMERA.height, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy])  # fmt: skip
+            table.writerow(flight_row(name, when, pose, CAMERA, georeference))
+
+
+def flight_row(
+    filename: str, when: datetime, map_from_camera: Rigid3, camera: Camera, georeference: Georeference
+) -> list[str]:
+    """A row of a ``*_flight.csv``, in the order of `COLUMNS`."""
+    eye = map_from_camera.translation
+    attitude = sequence.attitude_of(map_from_camera, georeference.convergence_rad(eye[:2]))
+    roll, pitch, yaw = np.degrees(rotation.to_euler(attitude))
+    quaternion = rotation.to_quaternion(map_from_camera.rotation.T)
+    size_and_focal = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    return [filename, when.strftime("%Y:%m:%d %H:%M:%S"), *(f"{v:.4f}" for v in eye),
+            *(f"{v:.10f}" for v in quaternion), f"{yaw:.6f}", f"{pitch:.6f}", f"{roll:.6f}",
+            *(str(v) for v in size_and_focal)]  # fmt: skip
 
 
 def lawnmower(bounds: tuple[float, float, float, float], step_m: float, count: int) -> FloatArray:

@@ -45,6 +45,7 @@ class Cover(IntEnum):
 
 
 FIRST_PARCEL = 8
+MAX_PARCELS = 256 - FIRST_PARCEL
 _FIXED_COLOURS = {
     Cover.YARD: (164, 158, 148),
     Cover.GRAVEL: (178, 164, 140),
@@ -119,12 +120,21 @@ class Scene:
     cars: tuple[Car, ...]
 
 
-def generate(spec: WorldSpec | None = None) -> World:
-    """The world of ``spec``; the same spec gives the same bytes."""
+def generate(spec: WorldSpec | None = None, layout: Layout | None = None, terrain: Float32Array | None = None) -> World:
+    """The world of ``spec``; the same arguments give the same bytes.
+
+    Args:
+        layout: what stands where, instead of what follows from the spec; its last two roads are the marked ones.
+        terrain: (H, W) m, bare earth, instead of hills made for the layout.
+    Raises: ValueError if the layout has more parcels than a cover's byte can tell apart.
+    """
     spec = spec or WorldSpec()
-    layout = generate_layout(spec.width_m, spec.height_m, spec.seed)
+    layout = layout or generate_layout(spec.width_m, spec.height_m, spec.seed)
+    if len(layout.parcels) > MAX_PARCELS:
+        raise ValueError(f"{len(layout.parcels)} parcels, at most {MAX_PARCELS}: make the world smaller")
     pen = _Pen(spec)
-    terrain = _terrain(spec, layout)
+    if terrain is None:
+        terrain = _terrain(spec, layout)
     cover = _cover(pen, layout)
     paint, detail = _markings(pen, layout), _details(pen, layout, spec.seed)
     g = spec.gsd_m

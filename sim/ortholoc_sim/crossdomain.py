@@ -1,0 +1,387 @@
+"""Benchmark sets across domains: ``python -m ortholoc_sim.crossdomain OUT --kind xDOP --photos 200 --seed 1``.
+
+A map (DOP, DSM) of a generated place at one time and photos of it with their true poses, written as a folder that
+`ortholoc-edge bench` takes (docs/sequences.md). What lies between the map and the photos is the kind, named as in the
+OrthoLoC paper:
+
+    same     the photos show the world of the map; only the sensors differ
+    xDOP     another season and hour (crops, leaves, grass, cast shadows), roofs repainted, cars moved, some trees
+             felled or new, another camera; buildings and terrain as in the DSM
+    xDOPDSM  besides, both layers of the map are older and coarser than the photos: buildings new or gone, more trees
+             felled, the others grown, the DSM smoothed and noisy
+
+Place, map and poses follow from the seed alone, so the kinds of one seed differ in nothing else.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
+from enum import StrEnum
+from functools import cached_property
+from pathlib import Path
+from typing import Any, TypeVar
+
+import cv2
+import numpy as np
+import rasterio
+from rasterio.transform import from_origin
+from tqdm import tqdm
+
+from ortholoc_edge.bench import sequence
+from ortholoc_edge.geometry import frames, rotation
+from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, ImageArray
+from ortholoc_edge.geometry.camera import Camera
+from ortholoc_edge.geometry.grid import RasterGrid
+from ortholoc_edge.geometry.rigid import Rigid3
+from ortholoc_edge.tiles.georeference import Georeference, VerticalDatum
+from ortholoc_sim.camera import Placement, Renderer, Sensor
+from ortholoc_sim.country import FRAME
+from ortholoc_sim.epoch import Epoch
+from ortholoc_sim.layout import FLAT_COLOURS, ROOF_COLOURS, Building, Layout
+from ortholoc_sim.lens import Exposure
+from ortholoc_sim.photos import COLUMNS, flight_row
+from ortholoc_sim.place import Place, make_place, rotated_crops
+from ortholoc_sim.season import epoch_at, other_time, survey_time
+from ortholoc_sim.world import Scene, WorldSpec, build_scene
+
+DOP_GSD_M, DSM_GSD_M = 0.2, 1.0
+WIDTH_PX, HEIGHT_PX = 640, 480
+_FOCAL_PX = (500.0, 700.0)
+_HEIGHT_AGL_M = (60.0, 150.0)
+_MAX_TILT_DEG = 45.0
+# Of the beta distribution of tilts: 7 % are above 30 degrees, the median is 13.
+_TILT_SHAPE = (1.3, 2.9)
+_ROLL_SIGMA_DEG = 2.5
+# Of a photo's ground width: so far from the border is the middle of what it shows.
+_BORDER_FOOTPRINTS = 1.2
+_EDGE_M = 15.0
+_ATTEMPTS = 10_000
+# Shares of what stands: of trees in the map that are felled, of trees in the photos that are new, of buildings gone
+# and new, of roofs repainted.
+_FELLED, _GROWN_UP = 0.06, 0.04
+_OLD_FELLED, _OLD_GROWN_UP, _TREE_GROWTH = 0.15, 0.10, 1.12
+_GONE, _NEW = 0.08, 0.08
+_REPAINTED = 0.25
+_DSM_SIGMA_M, _OLD_DSM_SIGMA_M = 0.05, 0.3
+_OLD_DSM_BLUR_M = 1.2
+_DOP_JPEG_QUALITY = 90
+
+_Thing = TypeVar("_Thing")
+
+
+class Kind(StrEnum):
+    """What lies between the map and the photos."""
+
+    SAME = "same"
+    XDOP = "xDOP"
+    XDOPDSM = "xDOPDSM"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapLayers:
+    """The map.
+
+    Attributes:
+        dop: (H, W, 3) uint8 RGB on ``dop_grid``.
+        dsm: (h, w) float32 m on ``dsm_grid``.
+    """
+
+    dop: ImageArray
+    dop_grid: RasterGrid
+    dsm: Float32Array
+    dsm_grid: RasterGrid
+
+
+@dataclass(frozen=True)
+class CrossDomain:
+    """The map and the photos of a seed and a kind; the same arguments give the same pixels.
+
+    Args:
+        width_m, height_m, gsd_m: of the place and its rasters; both sides a whole number of metres.
+    """
+
+    kind: Kind
+    seed: int = 1
+    width_m: float = 1200.0
+    height_m: float = 1000.0
+    gsd_m: float = 0.125
+
+    @cached_property
+    def place(self) -> Place:
+        return make_place(self.seed, self.width_m, self.height_m, self.gsd_m)
+
+    @cached_property
+    def survey(self) -> Epoch:
+        """When the map was flown."""
+        return epoch_at(survey_time(self.seed), "survey", self.seed * 2)
+
+    @cached_property
+    def flight(self) -> Epoch:
+        """When the photos were taken."""
+        if self.kind is Kind.SAME:
+            return self.survey
+        return epoch_at(other_time(self.seed), "flight", self.seed * 2 + 1)
+
+    @cached_property
+    def placement(self) -> Placement:
+        place = self.place
+        middle = np.array([place.west_m + self.width_m / 2, place.south_m + self.height_m / 2])
+        ground_m = float(np.median(place.world.terrain))
+        return Placement(place.west_m, place.south_m, self.georeference.grid_scale(middle, ground_m))
+
+    @cached_property
+    def georeference(self) -> Georeference:
+        place = self.place
+        return Georeference(FRAME, VerticalDatum(kind="unknown"), (place.west_m, place.south_m))
+
+    @cached_property
+    def camera(self) -> Camera:
+        focal_px = float(np.random.default_rng([self.seed, 110]).uniform(*_FOCAL_PX))
+        return Camera.from_focal(WIDTH_PX, HEIGHT_PX, round(focal_px, 1))
+
+    def survey_scene(self) -> Scene:
+        """The place when the map was flown."""
+        return build_scene(replace(self.place.world, layout=survey_layout(self.place)), self.survey)
+
+    def flight_scene(self) -> Scene:
+        """The place when the photos were taken."""
+        if self.kind is Kind.SAME:
+            return self.survey_scene()
+        return build_scene(
+            replace(self.place.world, layout=flight_layout(self.place, self.kind, self.flight)), self.flight
+        )
+
+    def layers(self, scene: Scene) -> MapLayers:
+        """The map of the scene of ``survey``."""
+        west, north = self.place.west_m, self.place.south_m + self.height_m
+        columns, rows = round(self.width_m / DOP_GSD_M), round(self.height_m / DOP_GSD_M)
+        # A survey's orthophoto is resampled from pictures: it has no detail at its own pixel.
+        soft = cv2.GaussianBlur(scene.texture, (0, 0), 0.45 * DOP_GSD_M / self.gsd_m)
+        dop = cv2.resize(soft, (columns, rows), interpolation=cv2.INTER_AREA)
+        dop_grid = RasterGrid(columns, rows, west, north, DOP_GSD_M, -DOP_GSD_M)
+        columns, rows = round(self.width_m / DSM_GSD_M), round(self.height_m / DSM_GSD_M)
+        dsm = np.asarray(cv2.resize(scene.surface, (columns, rows), interpolation=cv2.INTER_AREA), dtype=np.float32)
+        dsm_grid = RasterGrid(columns, rows, west, north, DSM_GSD_M, -DSM_GSD_M)
+        rng = np.random.default_rng([self.seed, 111])
+        white = rng.standard_normal(dsm.shape, dtype=np.float32)
+        if self.kind is Kind.XDOPDSM:
+            dsm = np.asarray(cv2.GaussianBlur(dsm, (0, 0), _OLD_DSM_BLUR_M / DSM_GSD_M), dtype=np.float32)
+            # Errors of image matching hang together over some metres.
+            smooth = cv2.GaussianBlur(rng.standard_normal(dsm.shape, dtype=np.float32), (0, 0), 2.5)
+            noise = white * np.float32(0.6) + smooth / smooth.std() * np.float32(0.8)
+            dsm = dsm + np.float32(_OLD_DSM_SIGMA_M) * noise
+        else:
+            dsm = dsm + np.float32(_DSM_SIGMA_M) * white
+        return MapLayers(np.asarray(dop, dtype=np.uint8), dop_grid, np.asarray(dsm, dtype=np.float32), dsm_grid)
+
+    def poses(self, count: int) -> list[Rigid3]:
+        """``map_from_camera`` of independent views: position, height above ground, heading and tilt by lot, such that
+        the photo lies inside and its middle 1.2 footprints from the border.
+
+        Raises: ValueError if the place is too small for them.
+        """
+        rng = np.random.default_rng([self.seed, 112])
+        found: list[Rigid3] = []
+        for _ in range(_ATTEMPTS + 50 * count):
+            if len(found) == count:
+                break
+            pose = self._drawn(rng)
+            if self._inside(pose):
+                found.append(pose)
+        if len(found) < count:
+            raise ValueError(f"{self.width_m:.0f} x {self.height_m:.0f} m have no room for photos; take a larger place")
+        return found
+
+    def renderer(self, scene: Scene) -> Renderer:
+        """Of clean pictures: the sensor's flaws are `Exposure`'s."""
+        return Renderer(scene, self.placement, Sensor(1.0, 0.0, 0.0, 0.0, 0))
+
+    def photo(self, renderer: Renderer, map_from_camera: Rigid3, index: int) -> ImageArray:
+        """(480, 640, 3) uint8 RGB: photo ``index`` of the flight, before JPEG."""
+        clean = renderer.render(self.camera, map_from_camera)
+        return self.exposure(index).expose(clean, self.camera, np.random.default_rng([self.seed, 113, index]))
+
+    def exposure(self, index: int) -> Exposure:
+        """The camera of the flight with the settings of one photo."""
+        camera = np.random.default_rng([self.seed, 114])
+        return Exposure.drawn(camera, np.random.default_rng([self.seed, 115, index]), mild=self.kind is Kind.SAME)
+
+    def _drawn(self, rng: np.random.Generator) -> Rigid3:
+        xy = rng.uniform((0.0, 0.0), (self.width_m, self.height_m))
+        height_m = rng.uniform(*_HEIGHT_AGL_M)
+        tilt_deg = _MAX_TILT_DEG * rng.beta(*_TILT_SHAPE)
+        roll, yaw = np.radians(rng.normal(0.0, _ROLL_SIGMA_DEG)), rng.uniform(-np.pi, np.pi)
+        # From grid north: the map's axes stand in for north, east, down.
+        ned_from_body = rotation.from_euler(float(roll), float(np.radians(tilt_deg)), float(yaw))
+        map_from_camera = frames.map_from_ned_rotation(0.0) @ ned_from_body @ frames.BODY_FROM_NADIR_CAMERA
+        ground_m = self._ground(xy)
+        eye = np.array([xy[0] + self.place.west_m, xy[1] + self.place.south_m, ground_m + height_m])
+        return Rigid3(map_from_camera, eye)
+
+    def _ground(self, local: FloatArray) -> float:
+        spec = self.place.world.spec
+        u, v = np.clip(np.round(spec.grid.px_from_map(local)).astype(int), 0, np.array(spec.shape[::-1]) - 1)
+        return float(self.place.world.terrain[v, u])
+
+    def _inside(self, pose: Rigid3) -> bool:
+        camera, place = self.camera, self.place
+        ends = np.array([[0, 0], [WIDTH_PX - 1, 0], [WIDTH_PX - 1, HEIGHT_PX - 1], [0, HEIGHT_PX - 1]])
+        px = np.concatenate([ends, [[camera.cx, camera.cy]]])
+        rays = camera.unproject(px) @ pose.rotation.T
+        if (rays[:, 2] > -0.1 * np.linalg.norm(rays, axis=1)).any():
+            return False
+        eye = pose.translation - (place.west_m, place.south_m, 0.0)
+        # A little below the ground under the camera: the land slopes.
+        depth_m = eye[2] - self._ground(eye[:2]) + 6.0
+        ground = eye[:2] + rays[:, :2] / -rays[:, 2:] * depth_m
+        footprint_m = depth_m / -rays[4, 2] * np.linalg.norm(rays[4]) * WIDTH_PX / camera.fx
+        size = np.array([self.width_m, self.height_m])
+        room = np.minimum(ground, size - ground).min(axis=1)
+        return bool((room[:4] > _EDGE_M).all() and room[4] > _BORDER_FOOTPRINTS * footprint_m)
+
+
+def survey_layout(place: Place) -> Layout:
+    """What the map shows: without what came later."""
+    layout = place.world.layout
+    buildings = _kept(layout.buildings, place.building_fate < 1.0 - _NEW)
+    return replace(layout, buildings=buildings, trees=_kept(layout.trees, place.tree_fate < 1.0 - _OLD_GROWN_UP))
+
+
+def flight_layout(place: Place, kind: Kind, epoch: Epoch) -> Layout:
+    """What stands there when the photos of a kind other than "same" are taken."""
+    layout, planted = place.world.layout, place.tree_fate
+    born = 1.0 - _OLD_GROWN_UP
+    buildings, built = layout.buildings, place.building_fate
+    if kind is Kind.XDOPDSM:
+        trees = tuple(
+            replace(tree, radius_m=tree.radius_m * _TREE_GROWTH, height_m=tree.height_m * _TREE_GROWTH)
+            for tree in _kept(layout.trees, planted >= _OLD_FELLED)
+        )
+        buildings, built = _kept(buildings, built >= _GONE), built[built >= _GONE]
+    else:
+        trees = _kept(layout.trees, (planted >= _FELLED) & (planted < born + _GROWN_UP))
+        buildings, built = _kept(buildings, built < 1.0 - _NEW), built[built < 1.0 - _NEW]
+    # By its fate, not in turn: a house has the same new colour whichever others are gone.
+    painted = tuple(
+        _repainted(house, np.random.default_rng([epoch.seed, 116, int(fate * 2**40)]))
+        for house, fate in zip(buildings, built, strict=True)
+    )
+    return replace(rotated_crops(layout, epoch.seed), buildings=painted, trees=trees)
+
+
+def _repainted(house: Building, rng: np.random.Generator) -> Building:
+    if rng.random() >= _REPAINTED:
+        return house
+    colours = [c for c in ROOF_COLOURS + FLAT_COLOURS if c != house.colour]
+    return replace(house, colour=colours[int(rng.integers(len(colours)))])
+
+
+def _kept(things: tuple[_Thing, ...], mask: BoolArray) -> tuple[_Thing, ...]:
+    return tuple(thing for thing, kept in zip(things, mask, strict=True) if kept)
+
+
+# --- files ---
+
+
+def write_set(out: Path, domain: CrossDomain, count: int, progress: bool = False) -> None:
+    """Write map, photos and flight table to ``out``; the files are named after the folder.
+
+    Raises: ValueError as `CrossDomain.poses`.
+    """
+    poses = domain.poses(count)
+    (out / "queries").mkdir(parents=True, exist_ok=True)
+    name = out.resolve().name
+    scene = domain.survey_scene()
+    _write_layers(out, name, domain.layers(scene))
+    if domain.kind is not Kind.SAME:
+        del scene  # half a gigabyte
+        scene = domain.flight_scene()
+    renderer = domain.renderer(scene)
+    start = datetime(2024, 1, 1) + timedelta(days=other_time(domain.seed).season.day, hours=9)
+    with (out / f"{name}_flight.csv").open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file)
+        table.writerow(COLUMNS)
+        for k, pose in enumerate(tqdm(poses, disable=not progress, unit="photo")):
+            photo = f"queries/{name}_{k:04d}.jpg"
+            quality = domain.exposure(k).jpeg_quality
+            image = domain.photo(renderer, pose, k)
+            cv2.imwrite(str(out / photo), image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+            # Minutes apart: every photo stands for itself.
+            when = start + timedelta(minutes=k)
+            table.writerow(flight_row(photo, when, pose, domain.camera, domain.georeference))
+
+
+def _write_layers(out: Path, name: str, layers: MapLayers) -> None:
+    jpeg = {"compress": "JPEG", "jpeg_quality": _DOP_JPEG_QUALITY, "photometric": "YCBCR", "interleave": "pixel"}
+    _write_tif(out / f"{name}_dop.tif", np.moveaxis(layers.dop, 2, 0), layers.dop_grid, **jpeg)
+    _write_tif(out / f"{name}_dsm.tif", layers.dsm[None], layers.dsm_grid, compress="DEFLATE", predictor=3)
+
+
+def _write_tif(path: Path, bands: ImageArray | Float32Array, grid: RasterGrid, **options: Any) -> None:
+    with rasterio.open(
+        path, "w", driver="GTiff", count=len(bands), dtype=bands.dtype.name, width=grid.width, height=grid.height,
+        crs=FRAME, transform=from_origin(grid.west, grid.top, grid.gsd_m, grid.gsd_m), tiled=True, **options,
+    ) as target:  # fmt: skip
+        target.write(bands)
+
+
+# --- for people ---
+
+
+def contact_sheet(folder: Path, names: list[int], grid_scale: float) -> Iterator[ImageArray]:
+    """Of a written set's photos, each beside its map as seen from the true pose, and the difference of the two.
+
+    Made of the files alone, with the map's own rasters: what does not fit is seen.
+    Returns: (480, 3 * 640, 3) RGB, one per photo.
+    """
+    dop_path, dsm_path = next(folder.glob("*_dop.tif")), next(folder.glob("*_dsm.tif"))
+    with rasterio.open(dop_path) as source:
+        dop = np.ascontiguousarray(np.moveaxis(source.read(), 0, 2))
+        bounds, gsd_m = source.bounds, float(source.res[0])
+    with rasterio.open(dsm_path) as source:
+        dsm = source.read(1)
+    surface = np.asarray(cv2.resize(dsm, dop.shape[1::-1], interpolation=cv2.INTER_LINEAR), dtype=np.float32)
+    spec = WorldSpec(0, dop.shape[1] * gsd_m, dop.shape[0] * gsd_m, gsd_m)
+    light = epoch_at(survey_time(0), "map", 0)  # lights façades, of which a map has none
+    none = np.zeros(surface.shape, dtype=np.uint16)
+    scene = Scene(spec, light, dop, surface, surface, none, (), (), ())
+    renderer = Renderer(scene, Placement(bounds.left, bounds.bottom, grid_scale), Sensor(1.0, 0.0, 0.0, 0.5, 0))
+    frames_seen = sequence.read_flight(folder)
+    for index in names:
+        frame = frames_seen[index]
+        photo = frame.image()
+        seen = renderer.render(frame.camera, frame.map_from_camera)
+        grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) for image in (photo, seen)]
+        levelled = [(g - g.mean()) / max(1.0, float(g.std())) for g in grey]
+        difference = np.clip(128.0 + 40.0 * (levelled[0] - levelled[1]), 0, 255).astype(np.uint8)
+        yield np.concatenate([photo, seen, cv2.merge([difference] * 3)], axis=1)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description="Make a map and photos of another time over it, with true poses.")
+    parser.add_argument("out", type=Path, metavar="OUT", help="folder of the set; its name is that of the files")
+    parser.add_argument(
+        "--kind", type=Kind, choices=list(Kind), default=Kind.XDOP, help="what lies between (default: %(default)s)"
+    )
+    parser.add_argument("--photos", type=int, default=100, help="how many (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=1, help="of place, looks and poses (default: %(default)s)")
+    parser.add_argument("--sheets", type=int, default=0, metavar="N", help="write PNGs of the first N photos beside "
+                        "their map to OUT/sheets (default: %(default)s)")  # fmt: skip
+    options = parser.parse_args(arguments)
+    domain = CrossDomain(options.kind, options.seed)
+    write_set(options.out, domain, options.photos, progress=True)
+    if options.sheets:
+        (options.out / "sheets").mkdir(exist_ok=True)
+        count = list(range(min(options.sheets, options.photos)))
+        for k, sheet in zip(count, contact_sheet(options.out, count, domain.placement.grid_scale), strict=True):
+            cv2.imwrite(str(options.out / "sheets" / f"{k:04d}.png"), sheet[..., ::-1])
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
