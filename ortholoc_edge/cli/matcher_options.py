@@ -19,15 +19,18 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--working-px",
         type=positive_int,
         default=640,
-        help="long side at which images are matched, px; a multiple of 32 for xfeat (default: %(default)s)",
+        help="long side at which images are matched, px; a multiple of 32 for all but sift (default: %(default)s)",
     )
     group.add_argument(
-        "--max-keypoints", type=positive_int, default=4096, help="per image; fewer are faster (default: %(default)s)"
+        "--max-keypoints",
+        type=positive_int,
+        default=4096,
+        help="per image; fewer are faster; xfeat-lighterglue takes 1024 at most (default: %(default)s)",
     )
     group.add_argument(
         "--threads", type=positive_int, default=1, help="threads of one inference (default: %(default)s)"
     )
-    group.add_argument("--model", type=Path, metavar="FILE", help="an ONNX file instead of the built model")
+    group.add_argument("--model", type=Path, metavar="FILE", help="an ONNX file instead of the built model; for xfeat")
     group.add_argument("--model-sha256", metavar="HASH", help="refuse --model unless it has this SHA-256")
     group.add_argument("--no-adhop", action="store_true", help="one matching round only")
 

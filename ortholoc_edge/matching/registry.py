@@ -10,7 +10,10 @@ from ortholoc_edge.matching import models
 from ortholoc_edge.matching.sift import SiftMatcher
 from ortholoc_edge.matching.types import Matcher
 
-MATCHERS: Final = ("xfeat", "sift")
+MATCHERS: Final = ("xfeat", "xfeat-star", "xfeat-lighterglue", "sift")
+
+# Matchers that run two graphs.
+_PAIRED: Final = ("xfeat-star", "xfeat-lighterglue")
 
 
 def make_matcher(
@@ -28,9 +31,9 @@ def make_matcher(
     Args:
         name: one of ``MATCHERS``.
         working_px: long side that images are brought to.
-        max_keypoints: per image.
+        max_keypoints: per image; LighterGlue takes no more than `lighterglue.MOST_KEYPOINTS`.
         threads: of one inference; SIFT takes OpenCV's setting (``cv2.setNumThreads``).
-        model_path: a model file instead of the store's.
+        model_path: a model file instead of the store's; not for matchers that run two.
         model_sha256: hash that the file must have; None: the record beside the file says it.
         progress: told of a build's steps.
     Raises: ConfigError for an unknown name, a number out of range or a model where none is used;
@@ -45,6 +48,13 @@ def make_matcher(
             if model_path is not None:
                 raise ConfigError(f"matcher 'sift' uses no model; leave {model_path} away")
             return SiftMatcher(working_px=working_px, max_keypoints=max_keypoints)
+        if name in _PAIRED:
+            if model_path is not None:
+                raise ConfigError(
+                    f"matcher {name!r} runs two models, {model_path} can't stand for both; leave it away and have "
+                    f"them in ${models.STORE_VARIABLE}/models"
+                )
+            return _paired(name, working_px, max_keypoints, threads, progress)
         # Not at the top: SIFT must work where the inference runtime does not.
         from ortholoc_edge.matching.xfeat import XFeatMatcher
 
@@ -58,3 +68,20 @@ def make_matcher(
         )
     except ValueError as err:
         raise ConfigError(f"matcher {name}: {err}") from err
+
+
+def _paired(
+    name: str, working_px: int, max_keypoints: int, threads: int, progress: models.Progress | None
+) -> Matcher:
+    # Late for the same reason.
+    from ortholoc_edge.matching.lighterglue import LighterGlueMatcher
+    from ortholoc_edge.matching.xfeat_star import XFeatStarMatcher
+
+    own = models.ensure(name, progress)
+    (needed,) = (models.ensure(one, progress) for one in models.known(name).needs)
+    first, second = (own.graph, own.sha256), (needed.graph, needed.sha256)
+    if name == "xfeat-star":
+        return XFeatStarMatcher(
+            first, second, working_px=working_px, max_keypoints=max_keypoints, threads=threads
+        )
+    return LighterGlueMatcher(second, first, working_px=working_px, max_keypoints=max_keypoints, threads=threads)

@@ -18,11 +18,19 @@ class Features:
         keypoints_px: (N, 2) float64, (u, v), pixel centres at integers.
         scores: (N,) float32, higher is better; falls or stays along the array.
         descriptors: (N, D) float32, unit length.
+        image_px: (width, height) of the image, for matchers that look at where in it a keypoint is.
+        lengths: (N,) float32, of the descriptors before they were made unit, for matchers that take them as they
+            were.
+        spacing_px: (N, 2) float64, (u, v): pixels of the image per pixel of what the keypoint was found in, for
+            matchers that shift keypoints.
     """
 
     keypoints_px: FloatArray
     scores: Float32Array
     descriptors: Float32Array
+    image_px: tuple[int, int] | None = None
+    lengths: Float32Array | None = None
+    spacing_px: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.keypoints_px)
@@ -64,7 +72,8 @@ class Matcher(Protocol):
 
     Attributes:
         name: as in ``--matcher``.
-        model_sha256: hash of the graph that runs, None for a matcher without weights.
+        model_sha256: hash of the graph that runs (of several: see `models.joint_sha256`), None for a matcher
+            without weights.
         working_px: the long side, in pixels, that images are brought to inside ``extract``; coordinates come
             back in the pixels of the image that was given.
     """

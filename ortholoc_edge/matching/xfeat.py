@@ -6,20 +6,18 @@ from typing import Final
 
 import cv2
 import numpy as np
-import onnxruntime as ort
 
-from ortholoc_edge.errors import ModelError
 from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
-from ortholoc_edge.matching.models import check_hash
+from ortholoc_edge.matching.inference import Inference
 from ortholoc_edge.matching.nearest import mutual_nearest
 from ortholoc_edge.matching.types import Features, Matches
 from ortholoc_edge.matching.working_image import WorkingImage, working_image
 
 _INPUT: Final = "normalised"
 _OUTPUTS: Final = ["features", "heat", "reliability"]
-_MULTIPLE: Final = 32  # the coarsest level of the network is at 1/32
-_CELL: Final = 8
-_DESCRIPTOR: Final = 64
+MULTIPLE_PX: Final = 32  # the coarsest level of the network is at 1/32
+CELL_PX: Final = 8
+DESCRIPTOR: Final = 64
 
 # The published detector's: heat threshold 0.05, non-maximum suppression over 5 x 5 (modules/xfeat.py).
 _MIN_HEAT: Final = 0.05
@@ -41,32 +39,9 @@ class XFeatNetwork:
     """
 
     def __init__(self, graph: bytes, sha256: str, threads: int) -> None:
-        check_hash(graph, sha256, "XFeat graph", "build it again with `ortholoc-edge models build xfeat`")
-        options = ort.SessionOptions()
-        options.intra_op_num_threads = threads
-        options.inter_op_num_threads = 1
-        options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
-        options.use_deterministic_compute = True
-        # The arena keeps the largest inference's memory for ever and buys no time here (shared notes).
-        options.enable_cpu_mem_arena = False
-        # Waiting threads would burn the core that the link to the autopilot runs on.
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        options.log_severity_level = 4  # what fails is raised, too
-        # ONNX Runtime's exceptions share no base but Exception.
-        try:
-            self._session = ort.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
-        except Exception as err:
-            raise ModelError(
-                f"XFeat graph can't be loaded by onnxruntime {ort.__version__} ({err}); "
-                "build it again with `ortholoc-edge models build xfeat`"
-            ) from err
-        inputs = [entry.name for entry in self._session.get_inputs()]
-        outputs = {entry.name for entry in self._session.get_outputs()}
-        if inputs != [_INPUT] or not outputs.issuperset(_OUTPUTS):
-            raise ModelError(
-                f"XFeat graph: inputs {inputs} and outputs {sorted(outputs)}, "
-                f"expected {[_INPUT]} and {_OUTPUTS}; this is another model's file"
-            )
+        self._inference = Inference(
+            graph, sha256, threads, what="XFeat", model="xfeat", inputs=[_INPUT], outputs=_OUTPUTS
+        )
 
     def run(self, grey: ImageArray, usable: BoolArray | None = None) -> tuple[Float32Array, Float32Array, Float32Array]:
         """Features (1, 64, H/8, W/8), heat (1, 1, H, W), reliability (1, 1, H/8, W/8) of ``grey``
@@ -74,13 +49,9 @@ class XFeatNetwork:
 
         Raises: ModelError if the runtime fails.
         """
-        try:
-            features, heat, reliability = self._session.run(_OUTPUTS, {_INPUT: _normalised(grey, usable)[None, None]})
-        except Exception as err:
-            raise ModelError(
-                f"XFeat inference failed on {grey.shape[1]} x {grey.shape[0]} px ({err}); "
-                "check memory, then build the model again with `ortholoc-edge models build xfeat`"
-            ) from err
+        features, heat, reliability = self._inference.run(
+            {_INPUT: normalised(grey, usable)[None, None]}, f"{grey.shape[1]} x {grey.shape[0]} px"
+        )
         return features, heat, reliability
 
 
@@ -108,9 +79,9 @@ class XFeatMatcher:
         min_cosine: float = 0.82,
         threads: int = 1,
     ) -> None:
-        if working_px < 2 * _MULTIPLE or working_px % _MULTIPLE or max_keypoints < 1 or threads < 1:
+        if working_px < 2 * MULTIPLE_PX or working_px % MULTIPLE_PX or max_keypoints < 1 or threads < 1:
             raise ValueError(
-                f"XFeat: working_px {working_px} must be a multiple of {_MULTIPLE} from {2 * _MULTIPLE} on, "
+                f"XFeat: working_px {working_px} must be a multiple of {MULTIPLE_PX} from {2 * MULTIPLE_PX} on, "
                 f"max_keypoints {max_keypoints} and threads {threads} at least 1"
             )
         self.name = "xfeat"
@@ -126,7 +97,7 @@ class XFeatMatcher:
         An image that is tiny, constant or invalid throughout has no features, which is no error.
         Raises: ModelError if the inference fails; ValueError if image or mask have another type or shape.
         """
-        width, height = _working_size(image.shape, self.working_px)
+        width, height = working_size(image.shape, self.working_px)
         return self._extracted(working_image(image, valid, width, height))
 
     def extract_unscaled(self, image: ImageArray, valid: BoolArray | None = None) -> Features:
@@ -135,7 +106,7 @@ class XFeatMatcher:
         For pictures that are already at the scale of what they are matched with.
         """
         rows, columns = image.shape
-        below, right = -rows % _MULTIPLE, -columns % _MULTIPLE
+        below, right = -rows % MULTIPLE_PX, -columns % MULTIPLE_PX
         if below or right:
             known = np.ones(image.shape, np.bool_) if valid is None else valid
             valid = np.pad(known, ((0, below), (0, right)))
@@ -144,7 +115,7 @@ class XFeatMatcher:
 
     def _extracted(self, work: WorkingImage | None) -> Features:
         if work is None:
-            return _no_features()
+            return no_features()
         features, heat, reliability = self._network.run(work.image, work.usable)
         pixels, scores = _keypoints(heat[0, 0], reliability[0, 0], work.usable, self._max_keypoints)
         # Rows of channels, so that a cell's 64 numbers lie together.
@@ -161,11 +132,11 @@ class XFeatMatcher:
         return Matches(query.keypoints_px[i], reference.keypoints_px[j])
 
 
-def _no_features() -> Features:
-    return Features(np.empty((0, 2)), np.empty(0, np.float32), np.empty((0, _DESCRIPTOR), np.float32))
+def no_features() -> Features:
+    return Features(np.empty((0, 2)), np.empty(0, np.float32), np.empty((0, DESCRIPTOR), np.float32))
 
 
-def _normalised(grey: ImageArray, usable: BoolArray | None) -> Float32Array:
+def normalised(grey: ImageArray, usable: BoolArray | None) -> Float32Array:
     """``grey`` with mean 0 and variance 1 over ``usable``.
 
     The published network does this inside, over the whole image. With holes that is wrong: a flat half takes
@@ -182,13 +153,13 @@ def _normalised(grey: ImageArray, usable: BoolArray | None) -> Float32Array:
     return np.asarray(cv2.LUT(grey, table), dtype=np.float32)
 
 
-def _working_size(shape: tuple[int, ...], working_px: int) -> tuple[int, int]:
+def working_size(shape: tuple[int, ...], working_px: int) -> tuple[int, int]:
     """(width, height), multiples of 32, nearest to the aspect of ``shape`` (rows, columns)."""
     rows, columns = shape[:2]
     longest = max(rows, columns, 1)
 
     def side(pixels: int) -> int:
-        return max(_MULTIPLE, round(pixels * working_px / longest / _MULTIPLE) * _MULTIPLE)
+        return max(MULTIPLE_PX, round(pixels * working_px / longest / MULTIPLE_PX) * MULTIPLE_PX)
 
     return side(columns), side(rows)
 
@@ -238,7 +209,7 @@ def _cell_position(pixels: FloatArray, axis: int) -> tuple[IntArray, Float32Arra
 
     The published code scales by W / (W - 1) here, off by up to half a pixel at the rims; this is plain geometry.
     """
-    position = (pixels[:, axis] + 0.5) / _CELL - 0.5
+    position = (pixels[:, axis] + 0.5) / CELL_PX - 0.5
     base = np.floor(position)
     return base.astype(np.intp), (position - base).astype(np.float32)
 

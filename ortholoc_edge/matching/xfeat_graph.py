@@ -7,27 +7,22 @@ skip joins, the 8x8 cell order) follows the published model and is proven by a s
 What is changed against the published network, none of which alters its function: the image is normalised
 by mean and variance before it comes in (so that invalid pixels can be left out of both), the batch
 normalisations are folded into the convolutions, the descriptor map is L2-normalised in the graph, and the
-keypoint logits become a full-resolution heat map. The fine matcher of the semi-dense variant is left out.
+keypoint logits become a full-resolution heat map. The semi-dense variant's graphs are apart: `xfeat_star_graph`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-import onnx
-from onnx import TensorProto, helper
 
-from ortholoc_edge.errors import ModelError
 from ortholoc_edge.geometry.arrays import Float32Array
+from ortholoc_edge.matching.onnx_writer import BATCH_NORM_EPSILON, OnnxWriter, Shape
 
 INPUT: Final = "normalised"
-OUTPUTS: Final = ("features", "heat", "reliability")
 
-_OPSET: Final = 20
-_IR_VERSION: Final = 10  # the oldest that holds opset 20, so that older runtimes load the file
-_EPSILON: Final = 1e-5  # torch's default for batch normalisation
 _CELL: Final = 8
 # exp(80) summed 65 times still fits float32. Logits on photos stay under 30, so the limit changes nothing
 # there; one white pixel on black reaches 94, which would give NaN.
@@ -46,33 +41,11 @@ _STRIDES: Final[dict[str, tuple[int, ...]]] = {
 }
 
 
-class _Writer:
-    """Collects nodes and initializers; each method adds one step and returns the name of its output."""
+class XFeatWriter(OnnxWriter):
+    """With the steps that XFeat is made of."""
 
-    def __init__(self, weights: dict[str, npt.NDArray[Any]]) -> None:
-        self._weights = weights
-        self._names: set[str] = set()
-        self.nodes: list[onnx.NodeProto] = []
-        self.initializers: list[onnx.TensorProto] = []
-
-    def weight(self, name: str) -> npt.NDArray[np.float64]:
-        try:
-            return self._weights[name].astype(np.float64)
-        except KeyError:
-            raise ModelError(
-                f"XFeat weights: tensor {name!r} is missing; this is another network's checkpoint"
-            ) from None
-
-    def constant(self, name: str, values: npt.ArrayLike, dtype: npt.DTypeLike) -> str:
-        if name not in self._names:
-            self._names.add(name)
-            array = np.ascontiguousarray(np.asarray(values, dtype=dtype))
-            self.initializers.append(onnx.numpy_helper.from_array(array, name))
-        return name
-
-    def node(self, op: str, inputs: list[str], output: str, **attributes: Any) -> str:
-        self.nodes.append(helper.make_node(op, inputs, [output], name=output, **attributes))
-        return output
+    def __init__(self, weights: Mapping[str, npt.NDArray[Any]]) -> None:
+        super().__init__(weights, "XFeat")
 
     def conv(
         self,
@@ -104,7 +77,7 @@ class _Writer:
         """Convolution, batch normalisation without own scale and shift, ReLU; as many as the block has."""
         for index, stride in enumerate(_STRIDES[name]):
             layer = f"{name}.{index}.layer"
-            gain = 1.0 / np.sqrt(self.weight(f"{layer}.1.running_var") + _EPSILON)
+            gain = 1.0 / np.sqrt(self.weight(f"{layer}.1.running_var") + BATCH_NORM_EPSILON)
             kernel = self.weight(f"{layer}.0.weight") * gain[:, None, None, None]
             bias = -self.weight(f"{layer}.1.running_mean") * gain
             x = self.conv(x, f"{name}.{index}", kernel.astype(np.float32), bias, stride=stride, relu=True)
@@ -126,7 +99,8 @@ class _Writer:
         )
 
 
-def _outputs(w: _Writer) -> None:
+def write_backbone(w: XFeatWriter) -> str:
+    """From the normalised image to the map of 64 numbers per cell, not yet of unit length."""
     pooled = w.node("AveragePool", [INPUT], "skip1.0", kernel_shape=[4, 4], strides=[4, 4])
     skip = w.plain_conv(pooled, "skip1.1")
     quarter = w.block(w.node("Add", [w.block(INPUT, "block1"), skip], "skip_joined"), "block2")
@@ -135,15 +109,22 @@ def _outputs(w: _Writer) -> None:
     thirtysecond = w.block(sixteenth, "block5")
     pyramid = w.node("Add", [eighth, w.enlarge(sixteenth, 2)], "pyramid16")
     pyramid = w.node("Add", [pyramid, w.enlarge(thirtysecond, 4)], "pyramid32")
-    fused = w.plain_conv(w.block(pyramid, "block_fusion"), "block_fusion.2")
+    return w.plain_conv(w.block(pyramid, "block_fusion"), "block_fusion.2")
 
+
+def write_reliability(w: XFeatWriter, fused: str) -> None:
+    """The output ``reliability`` of the map that `write_backbone` gives."""
+    logit = w.plain_conv(w.block(fused, "heatmap_head"), "heatmap_head.2")
+    w.node("Sigmoid", [logit], "reliability")
+
+
+def _write_sparse(w: XFeatWriter) -> None:
+    fused = write_backbone(w)
     axis = w.constant("channel_axis", [1], np.int64)
     length = w.node("ReduceL2", [fused, axis], "length", keepdims=1)
     length = w.node("Max", [length, w.constant("tiny", 1e-12, np.float32)], "length_floor")
     w.node("Div", [fused, length], "features")
-
-    logit = w.plain_conv(w.block(fused, "heatmap_head"), "heatmap_head.2")
-    w.node("Sigmoid", [logit], "reliability")
+    write_reliability(w, fused)
 
     # 65 logits per 8x8 cell: 64 pixels in row order and "no keypoint here". Softmax over them, last one
     # dropped. Written out because the runtime's Softmax over axis 1 transposes: 2 ms slower at 640 (shared notes).
@@ -157,7 +138,7 @@ def _outputs(w: _Writer) -> None:
     w.node("DepthToSpace", [share], "heat", blocksize=_CELL, mode="DCR")
 
 
-def xfeat_onnx(weights: dict[str, npt.NDArray[Any]], source: str) -> bytes:
+def xfeat_onnx(weights: Mapping[str, npt.NDArray[Any]], source: str) -> bytes:
     """The graph as ONNX bytes; the same weights and ``onnx`` version give the same bytes.
 
     Input ``normalised`` (1, 1, H, W) float32 grey of mean 0 and variance 1, H and W multiples of 32.
@@ -169,34 +150,11 @@ def xfeat_onnx(weights: dict[str, npt.NDArray[Any]], source: str) -> bytes:
         source: written into the file, says where the weights are from.
     Raises: ModelError if the weights are not XFeat's.
     """
-    writer = _Writer(weights)
-    _outputs(writer)
-
-    def value(name: str, shape: list[int | str]) -> onnx.ValueInfoProto:
-        return helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)
-
-    graph = helper.make_graph(
-        writer.nodes,
-        "xfeat",
-        [value(INPUT, [1, 1, "H", "W"])],
-        [
-            value("features", [1, 64, "H8", "W8"]),
-            value("heat", [1, 1, "H", "W"]),
-            value("reliability", [1, 1, "H8", "W8"]),
-        ],
-        initializer=writer.initializers,
-    )
-    model = helper.make_model(
-        graph,
-        producer_name="ortholoc-edge",
-        ir_version=_IR_VERSION,
-        opset_imports=[helper.make_opsetid("", _OPSET)],
-        doc_string=source,
-    )
-    try:
-        onnx.checker.check_model(model, full_check=True)
-    except (onnx.checker.ValidationError, onnx.shape_inference.InferenceError) as err:
-        raise ModelError(
-            f"XFeat weights: they do not form the network ({err}); this is another network's checkpoint"
-        ) from err
-    return bytes(model.SerializeToString(deterministic=True))
+    writer = XFeatWriter(weights)
+    _write_sparse(writer)
+    outputs: dict[str, Shape] = {
+        "features": [1, 64, "H8", "W8"],
+        "heat": [1, 1, "H", "W"],
+        "reliability": [1, 1, "H8", "W8"],
+    }
+    return writer.model("xfeat", source, {INPUT: [1, 1, "H", "W"]}, outputs)

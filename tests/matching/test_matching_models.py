@@ -197,7 +197,7 @@ def test_another_graph_is_refused() -> None:
 
 def test_names_and_numbers_of_matchers_are_checked(tmp_path: Path, filled: Path) -> None:
     assert make_matcher("sift", working_px=512, max_keypoints=2048, threads=1).name == "sift"
-    with pytest.raises(ConfigError, match="known are: xfeat, sift"):
+    with pytest.raises(ConfigError, match="known are: xfeat, xfeat-star, xfeat-lighterglue, sift"):
         make_matcher("surf", working_px=512, max_keypoints=2048, threads=1)
     with pytest.raises(ConfigError, match="multiple of 32"):
         make_matcher("xfeat", working_px=500, max_keypoints=2048, threads=1)
@@ -221,7 +221,9 @@ def test_command_line_lists_states(
     assert "not built; `ortholoc-edge models build xfeat`" in capsys.readouterr().out
     shutil.copytree(xfeat_model.path.parent, store)
     assert _run("list", "--json") == 0
-    (entry,) = json.loads(capsys.readouterr().out)
+    entries = {entry["name"]: entry for entry in json.loads(capsys.readouterr().out)}
+    assert list(entries) == list(models.CATALOGUE)
+    entry = entries["xfeat"]
     assert (entry["state"], entry["licence"], entry["bytes"]) == (
         "ready",
         "Apache-2.0",
