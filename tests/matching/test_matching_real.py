@@ -10,9 +10,11 @@ import pytest
 from ortholoc_edge.geometry.arrays import BoolArray, FloatArray, ImageArray
 from ortholoc_edge.matching import models
 from ortholoc_edge.matching.adhop import fit_homography
+from ortholoc_edge.matching.lighterglue import LighterGlueMatcher
 from ortholoc_edge.matching.sift import SiftMatcher
 from ortholoc_edge.matching.types import Matcher
 from ortholoc_edge.matching.xfeat import XFeatMatcher
+from ortholoc_edge.matching.xfeat_star import XFeatStarMatcher
 
 SHARED = Path(os.environ.get("ORTHOLOC_EDGE_SHARED", Path(__file__).parents[2].parent / "shared"))
 
@@ -48,6 +50,10 @@ CASES = [
     ("xfeat", "caliterra/samples/CALITERRA_R0001.npz", 270),
     ("xfeat", "copr/samples/COPR_R0000.npz", 320),
     ("xfeat", "seneca/samples/SENECA_R0000.npz", 30),
+    ("xfeat-star", "caliterra/samples/CALITERRA_R0001.npz", 280),
+    ("xfeat-star", "copr/samples/COPR_R0000.npz", 470),
+    ("xfeat-lighterglue", "caliterra/samples/CALITERRA_R0001.npz", 150),
+    ("xfeat-lighterglue", "copr/samples/COPR_R0000.npz", 165),
     ("sift", "caliterra/samples/CALITERRA_R0001.npz", 700),
     ("sift", "seneca/samples/SENECA_R0000.npz", 60),
 ]
@@ -60,6 +66,14 @@ def test_photo_matches_its_orthophoto(request: pytest.FixtureRequest, name: str,
     if name == "xfeat":
         model: models.StoredModel = request.getfixturevalue("xfeat_model")
         matcher = XFeatMatcher(model.graph, model.sha256)
+    elif name != "sift":
+        built: dict[str, models.StoredModel] = request.getfixturevalue("all_models")
+        graphs = {one: (stored.graph, stored.sha256) for one, stored in built.items()}
+        matcher = (
+            XFeatStarMatcher(graphs["xfeat-star"], graphs["xfeat-star-fine"])
+            if name == "xfeat-star"
+            else LighterGlueMatcher(graphs["xfeat"], graphs["xfeat-lighterglue"])
+        )
     matches = matcher.match(matcher.extract(query), matcher.extract(dop, valid))
     u, v = np.clip(np.rint(matches.query_px).astype(int).T, 0, [[query.shape[1] - 1], [query.shape[0] - 1]])
     errors = matches.map_px - true[v, u]
