@@ -29,8 +29,8 @@ _MIN_FINE: Final = 0.25
 _TEMPERATURE: Final = 3.0
 # Place in the cell that stands for no shift. The published matcher has 4, and puts a cell's keypoint into its corner.
 # So a made scene and six recorded pictures, cut out twice up to 8 px apart, came out 0.9 to 1.2 px off (in u and in v,
-# mean over the pairs, pixels of the level), and a scene seen at two scales 2.0 px. With 3, and the cell's middle, 0.15
-# and 0.2 px are left. Half a pixel of that is clear: the network learnt places that were rounded down.
+# mean over the pairs, pixels of the level), and a scene seen at two scales 2.1 px. With 3, and the cell's middle, 0.15
+# and 0.23 px are left. Half a pixel of that is clear: the network learnt places that were rounded down.
 _MIDDLE: Final = 3.0
 
 
