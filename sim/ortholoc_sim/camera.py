@@ -1,6 +1,6 @@
 """What a camera over the generated world sees: perspective, occlusion, façades, and the flaws of a sensor.
 
-No GPU: every pixel's ray is marched against the height field, first over grids of local maxima (8, 2 and 0.5 m),
+No GPU: every pixel's ray is marched against the height field, first over grids of local maxima (about 8, 2 and 0.5 m),
 where it may take long strides without passing through anything, then in steps of a texel until it is below the
 surface, and bisected there. Between texels the surface is interpolated, so a wall leans over one texel and a roof ends
 half a texel early on average (6 cm in the demo).
@@ -88,7 +88,9 @@ class Renderer:
     def __init__(self, scene: Scene, placement: Placement, sensor: Sensor | None = None) -> None:
         self.scene, self.placement, self.sensor = scene, placement, sensor or Sensor()
         gsd = scene.spec.gsd_m
-        self._maxima = [_dilated_maximum(scene.surface, round(cell / gsd)) for cell in _CELLS_M]
+        # Cells are whole texels: 0.5 m of 0.2 m texels are cells of 0.4 m.
+        blocks = [max(1, round(cell / gsd)) for cell in _CELLS_M]
+        self._maxima = [(_dilated_maximum(scene.surface, block), block * gsd) for block in blocks]
         self._highest = float(scene.surface.max())
         self._textures = [scene.texture]
         for _ in range(3):
@@ -178,7 +180,7 @@ class Renderer:
         """Descent in m from the eye to the first hit of every ray, and one a little before it."""
         slope = np.maximum(np.hypot(ray.a, ray.b), np.float32(1e-3))
         descent = np.full(len(slope), max(0.0, ray.height - self._highest - 0.1), dtype=np.float32)
-        for maxima, cell, strides in zip(self._maxima, _CELLS_M, _STRIDES, strict=True):
+        for (maxima, cell), strides in zip(self._maxima, _STRIDES, strict=True):
             reach = np.float32(0.98 * cell) / slope
             for _ in range(strides):
                 x, y = ray.xy(descent)

@@ -18,7 +18,7 @@ from __future__ import annotations
 import argparse
 import csv
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from enum import StrEnum
@@ -29,7 +29,7 @@ from typing import Any, TypeVar
 import cv2
 import numpy as np
 import rasterio
-from rasterio.transform import from_origin
+from rasterio.transform import Affine
 from tqdm import tqdm
 
 from ortholoc_edge.bench import sequence
@@ -41,12 +41,13 @@ from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.tiles.georeference import Georeference, VerticalDatum
 from ortholoc_sim.camera import Placement, Renderer, Sensor
 from ortholoc_sim.country import FRAME
+from ortholoc_sim.detail import Detail
 from ortholoc_sim.epoch import Epoch
 from ortholoc_sim.layout import FLAT_COLOURS, ROOF_COLOURS, Building, Layout
 from ortholoc_sim.lens import Exposure
 from ortholoc_sim.photos import COLUMNS, flight_row
 from ortholoc_sim.place import Place, make_place, rotated_crops
-from ortholoc_sim.season import epoch_at, other_time, survey_time
+from ortholoc_sim.season import Moment, epoch_at, other_time, survey_time
 from ortholoc_sim.world import Scene, WorldSpec, build_scene
 
 DOP_GSD_M, DSM_GSD_M = 0.2, 1.0
@@ -117,15 +118,18 @@ class CrossDomain:
 
     @cached_property
     def survey(self) -> Epoch:
-        """When the map was flown."""
+        """How the place looked when the map was flown."""
         return epoch_at(survey_time(self.seed), "survey", self.seed * 2)
 
     @cached_property
-    def flight(self) -> Epoch:
+    def flown(self) -> Moment:
         """When the photos were taken."""
-        if self.kind is Kind.SAME:
-            return self.survey
-        return epoch_at(other_time(self.seed), "flight", self.seed * 2 + 1)
+        return survey_time(self.seed) if self.kind is Kind.SAME else other_time(self.seed)
+
+    @cached_property
+    def flight(self) -> Epoch:
+        """How the place looks when the photos are taken."""
+        return self.survey if self.kind is Kind.SAME else epoch_at(self.flown, "flight", self.seed * 2 + 1)
 
     @cached_property
     def placement(self) -> Placement:
@@ -138,6 +142,10 @@ class CrossDomain:
     def georeference(self) -> Georeference:
         place = self.place
         return Georeference(FRAME, VerticalDatum(kind="unknown"), (place.west_m, place.south_m))
+
+    @cached_property
+    def _detail(self) -> Detail:
+        return Detail(self.seed, self.flown.season.bare)
 
     @cached_property
     def camera(self) -> Camera:
@@ -203,7 +211,10 @@ class CrossDomain:
 
     def photo(self, renderer: Renderer, map_from_camera: Rigid3, index: int) -> ImageArray:
         """(480, 640, 3) uint8 RGB: photo ``index`` of the flight, before JPEG."""
-        clean = renderer.render(self.camera, map_from_camera)
+        view = renderer.view(self.camera, map_from_camera)
+        eye, axis = map_from_camera.translation, map_from_camera.rotation[:, 2]
+        distance_m = (eye[2] - float(np.nanmedian(view.points_map[..., 2]))) / -axis[2]
+        clean = self._detail.added(view, np.array([self.place.west_m, self.place.south_m]), distance_m / self.camera.fx)
         return self.exposure(index).expose(clean, self.camera, np.random.default_rng([self.seed, 113, index]))
 
     def exposure(self, index: int) -> Exposure:
@@ -302,7 +313,7 @@ def write_set(out: Path, domain: CrossDomain, count: int, progress: bool = False
         del scene  # half a gigabyte
         scene = domain.flight_scene()
     renderer = domain.renderer(scene)
-    start = datetime(2024, 1, 1) + timedelta(days=other_time(domain.seed).season.day, hours=9)
+    start = datetime(2024, 1, 1) + timedelta(days=domain.flown.season.day - 1, hours=9)
     with (out / f"{name}_flight.csv").open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(COLUMNS)
@@ -325,7 +336,7 @@ def _write_layers(out: Path, name: str, layers: MapLayers) -> None:
 def _write_tif(path: Path, bands: ImageArray | Float32Array, grid: RasterGrid, **options: Any) -> None:
     with rasterio.open(
         path, "w", driver="GTiff", count=len(bands), dtype=bands.dtype.name, width=grid.width, height=grid.height,
-        crs=FRAME, transform=from_origin(grid.west, grid.top, grid.gsd_m, grid.gsd_m), tiled=True, **options,
+        crs=FRAME, transform=Affine(grid.dx, 0.0, grid.west, 0.0, grid.dy, grid.top), tiled=True, **options,
     ) as target:  # fmt: skip
         target.write(bands)
 
@@ -333,10 +344,13 @@ def _write_tif(path: Path, bands: ImageArray | Float32Array, grid: RasterGrid, *
 # --- for people ---
 
 
-def contact_sheet(folder: Path, names: list[int], grid_scale: float) -> Iterator[ImageArray]:
+def contact_sheet(folder: Path, photos: Iterable[int], grid_scale: float) -> Iterator[ImageArray]:
     """Of a written set's photos, each beside its map as seen from the true pose, and the difference of the two.
 
     Made of the files alone, with the map's own rasters: what does not fit is seen.
+    Args:
+        photos: rows of the flight's table.
+        grid_scale: metres of the map per true metre there.
     Returns: (480, 3 * 640, 3) RGB, one per photo.
     """
     dop_path, dsm_path = next(folder.glob("*_dop.tif")), next(folder.glob("*_dsm.tif"))
@@ -351,9 +365,9 @@ def contact_sheet(folder: Path, names: list[int], grid_scale: float) -> Iterator
     none = np.zeros(surface.shape, dtype=np.uint16)
     scene = Scene(spec, light, dop, surface, surface, none, (), (), ())
     renderer = Renderer(scene, Placement(bounds.left, bounds.bottom, grid_scale), Sensor(1.0, 0.0, 0.0, 0.5, 0))
-    frames_seen = sequence.read_flight(folder)
-    for index in names:
-        frame = frames_seen[index]
+    recorded = sequence.read_flight(folder)
+    for index in photos:
+        frame = recorded[index]
         photo = frame.image()
         seen = renderer.render(frame.camera, frame.map_from_camera)
         grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) for image in (photo, seen)]
@@ -377,7 +391,7 @@ def main(arguments: list[str] | None = None) -> int:
     write_set(options.out, domain, options.photos, progress=True)
     if options.sheets:
         (options.out / "sheets").mkdir(exist_ok=True)
-        count = list(range(min(options.sheets, options.photos)))
+        count = range(min(options.sheets, options.photos))
         for k, sheet in zip(count, contact_sheet(options.out, count, domain.placement.grid_scale), strict=True):
             cv2.imwrite(str(options.out / "sheets" / f"{k:04d}.png"), sheet[..., ::-1])
     return 0

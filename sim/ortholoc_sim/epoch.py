@@ -37,6 +37,7 @@ class Epoch:
         grass, leaves, needles, water, soil: colours.
         changed: fraction of roofs repainted and of trees felled or grown; None at the time of the survey, to
             which changes are relative.
+        tint: 1 sigma of how patches of plants differ in colour, as a share of it.
     """
 
     name: str
@@ -55,6 +56,7 @@ class Epoch:
     water: Rgb
     soil: Rgb
     changed: float | None
+    tint: float = 0.04
 
     @property
     def sun(self) -> FloatArray:

@@ -51,6 +51,7 @@ _MIN_SHARE, _MAX_SHARE = 0.08, 0.33
 _HEDGED = 0.4
 # Between the crowns of a forest one looks on branches, not on its ground.
 _CANOPY_M, _CANOPY_DARK = 8.0, 52
+_LOWEST_CROWN_M = 2.5
 _SHORE_M = 7.0
 _TERRAIN_STEP = 16
 _CLEARANCE_PX_M = 0.5
@@ -324,7 +325,8 @@ def _planted(plot: Plot, low: FloatArray) -> tuple[FloatArray, ...]:
     if plot.use != FOREST:
         return trees.xy - low, trees.radius_m, trees.height_m, conifer, trees.chance
     # In a closed canopy crowns meet.
-    return trees.xy - low, trees.radius_m * (1.2 + 0.25 * conifer), trees.height_m - _CANOPY_M, conifer, trees.chance
+    height = np.maximum(trees.height_m - _CANOPY_M, _LOWEST_CROWN_M)
+    return trees.xy - low, trees.radius_m * (1.2 + 0.25 * conifer), height, conifer, trees.chance
 
 
 def _trees(

@@ -20,6 +20,7 @@ _OVERCAST_SHARE = 0.15
 _TONE_SIGMA = 0.04
 # The world's relief and grain make colours richer than they are picked.
 _SATURATION = 0.72
+_TINT = 0.022
 _ATTEMPTS = 1000
 
 
@@ -31,6 +32,7 @@ class Season:
         day: of the year.
         crops: by crop.
         grass, leaves, leaves_spread, needles, soil: colours.
+        bare: whether the trees that shed leaves have none.
     """
 
     name: str
@@ -41,6 +43,7 @@ class Season:
     leaves_spread: Rgb
     needles: Rgb
     soil: Rgb
+    bare: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +74,7 @@ MARCH = Season(
     "March", 80,
     _crops(((126, 130, 90), 0.05, 0.0), ((100, 126, 76), 0.10, 0.1), ((142, 118, 94), 0.13, 0.0),
            ((152, 127, 101), 0.10, 0.0), ((94, 120, 70), 0.10, 0.25), ((124, 128, 90), 0.08, 0.0)),
-    (124, 127, 90), (120, 108, 94), (10, 8, 6), (54, 76, 54), (148, 122, 96),
+    (124, 127, 90), (120, 108, 94), (10, 8, 6), (54, 76, 54), (148, 122, 96), True,
 )  # fmt: skip
 MAY = Season(
     "May", 130,
@@ -160,4 +163,5 @@ def epoch_at(moment: Moment, name: str, seed: int) -> Epoch:
         soil=season.soil,
         # What changed is decided by whoever asks for the layout of the time.
         changed=None,
+        tint=_TINT,
     )

@@ -549,7 +549,7 @@ class _Builder:
         shade, lit = self.shade(), self.light()
         tint = octaves(self.spec.shape, (12.0 / g, 45.0 / g), (0.6, 1.0), self.spec.seed + 70)
         tint += np.float32(0.6) * blobs(self.spec.shape, 30.0 / g, epoch.seed + 71)
-        tint *= self.per_cover({**dict.fromkeys(_FIXED_COLOURS, 0.0), Cover.WATER: 0.0}, 0.04)
+        tint *= self.per_cover({**dict.fromkeys(_FIXED_COLOURS, 0.0), Cover.WATER: 0.0}, epoch.tint)
         tint[self.objects > 0] = 0.0
         out = np.empty((*self.spec.shape, 3), dtype=np.uint8)
         for channel, plane in enumerate(self.planes):
