@@ -34,6 +34,7 @@ from ortholoc_edge.tiles.georeference import (
 )
 from ortholoc_edge.tiles.install import install, work_folder
 from ortholoc_edge.tiles.lattice import CROP_PX, Lattice, PixelBox, meeting
+from ortholoc_edge.tiles.levels import STORED_LEVELS
 from ortholoc_edge.tiles.manifest import (
     FORMAT,
     MANIFEST_NAME,
@@ -588,6 +589,7 @@ class _Build:
         dop = Dop(
             lattice=plan.dop.lattice,
             tiles=dop_tiles,
+            stored_levels=STORED_LEVELS,
             compression=_described(settings),
             sources=_notes(plan.dop, dop_order, plan.crs),
             date=options.dop_date,
@@ -599,6 +601,7 @@ class _Build:
         dsm = Dsm(
             lattice=plan.dsm.lattice,
             tiles=dsm_tiles,
+            stored_levels=STORED_LEVELS,
             compression="LERC_ZSTD",
             sources=_notes(plan.dsm, dsm_order, plan.crs),
             date=options.dsm_date,

@@ -11,7 +11,7 @@ import threading
 import warnings
 import zlib
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -83,10 +83,11 @@ class Handles:
         key = id(cog), level
         dataset = self._open.get(key)
         if dataset is None:
+            dataset = cog.open_level(level)
             if len(self._open) >= self._limit:
                 self._open.popitem(last=False)[1].close()
                 _give_back()
-            dataset = self._open[key] = cog.open_level(level)
+            self._open[key] = dataset
         self._open.move_to_end(key)
         return dataset
 
@@ -110,7 +111,7 @@ class Cog:
         self.path = path
         self._data = data
         self._handles = Handles() if handles is None else handles
-        self._grids: tuple[RasterGrid, ...] | None = None
+        self._grids: Mapping[int, RasterGrid] | None = None
         self._nodata: float | None = None
         self._memory: MemoryFile | None = MemoryFile(data)
 
@@ -130,18 +131,21 @@ class Cog:
             self._memory = None
 
     @property
-    def grids(self) -> tuple[RasterGrid, ...]:
-        """Grids of the levels, finest first. Raises: MapError if it is no tiled GeoTIFF of ours."""
+    def grids(self) -> Mapping[int, RasterGrid]:
+        """Grids of the levels that the file has, finest first: level k has pixels of 2^k times the side.
+
+        Raises: MapError if it is no tiled GeoTIFF of ours.
+        """
         if self._grids is None:
             with self._handles.lock:
                 full = self._handles.get(self, 0)
                 if full.block_shapes[0] != (BLOCK_PX, BLOCK_PX):
                     raise MapError(f"{self.path}: blocks of {full.block_shapes[0]} px, expected {BLOCK_PX}")
-                grids = [raster_grid(full, self.path)]
-                for level in range(len(full.overviews(1))):
-                    size = self._handles.get(self, level + 1).shape
-                    grids.append(grids[0].resized(size[1], size[0]))
-            self._grids = tuple(grids)
+                finest = raster_grid(full, self.path)
+                self._grids = {
+                    level: finest.resized(finest.width >> level, finest.height >> level)
+                    for level in _levels(full, self.path)
+                }
         return self._grids
 
     @property
@@ -150,9 +154,11 @@ class Cog:
         with self._handles.lock:
             return self._handles.get(self, 0).crs
 
-    def require(self, grids: Sequence[RasterGrid], dtypes: Sequence[str], nodata: float | None) -> None:
+    def require(self, grids: Mapping[int, RasterGrid], dtypes: Sequence[str], nodata: float | None) -> None:
         """Check that this is the raster it is taken for; of the overviews, that they are there.
 
+        Args:
+            grids: by level, finest first.
         Raises: MapError naming what differs.
         """
         with self._handles.lock:
@@ -164,18 +170,20 @@ class Cog:
                 )
             if nodata is not None and full.nodata != nodata:
                 raise MapError(f"{self.path}: nodata {full.nodata}, expected {nodata}; rebuild the pack")
-            found, levels = raster_grid(full, self.path), 1 + len(full.overviews(1))
-        if not _same_place(found, grids[0]) or levels != len(grids):
+            found, levels = raster_grid(full, self.path), _levels(full, self.path)
+        if not _same_place(found, grids[0]) or levels != list(grids):
             raise MapError(
-                f"{self.path}: {levels} levels of {found}, expected {len(grids)} of {grids[0]}; rebuild the pack"
+                f"{self.path}: levels {levels} of {found}, expected {list(grids)} of {grids[0]}; rebuild the pack"
             )
         # What a level's size is, is seen when it is read.
-        self._grids = tuple(grids)
+        self._grids = grids
 
     def read_image(self, level: int, window: PixelWindow) -> tuple[ImageArray, BoolArray]:
-        """RGB (3, H, W) uint8 and validity (H, W) of a window inside the level."""
+        """RGB (3, H, W) uint8, black where invalid, and validity (H, W) of a window inside the level."""
         bands, mask = self._read(level, window, with_mask=True)
-        return bands, mask > 0
+        valid: BoolArray = mask > 0
+        # There the picture was made up, to compress well.
+        return bands if valid.all() else bands * valid, valid
 
     def read_heights(self, level: int, window: PixelWindow) -> Float32Array:
         """Heights (H, W) float32 of a window inside the level, NaN where there is no data."""
@@ -186,7 +194,7 @@ class Cog:
 
     def blocks(self) -> Iterator[Block]:
         """All blocks of all levels."""
-        for level, grid in enumerate(self.grids):
+        for level, grid in self.grids.items():
             yield from touched(level, PixelWindow(0, 0, grid.width, grid.height))
 
     def undecodable(self) -> list[Block]:
@@ -232,7 +240,7 @@ class Cog:
             # To rasterio an empty file is one to be written.
             raise UndecodableError(f"{self.path}: empty; copy the pack again")
         # Nothing but a TIFF: other formats of GDAL's lead to other files.
-        overview = {} if level == 0 else {"overview_level": level - 1}
+        overview = {} if level == 0 else {"overview_level": self._overview(level)}
         try:
             with quiet_georeference():
                 return self._memory.open(driver="GTiff", **overview)
@@ -248,13 +256,17 @@ class Cog:
                 raise MapError(f"{self.path}: names no nodata value; rebuild the pack")
         return np.float32(self._nodata)
 
+    def _overview(self, level: int) -> int | None:
+        """GDAL's number of a level; None: the full resolution."""
+        return list(self.grids).index(level) - 1 if level else None
+
     def _offsets(self) -> dict[Block, int]:
         offsets = {}
         with self._handles.lock:
             full = self._handles.get(self, 0)
             for block in self.blocks():
                 name = f"BLOCK_OFFSET_{block.column}_{block.row}"
-                item = full.get_tag_item(name, "TIFF", bidx=1, ovr=block.level - 1 if block.level else None)
+                item = full.get_tag_item(name, "TIFF", bidx=1, ovr=self._overview(block.level))
                 if item is not None:
                     offsets[block] = int(item)
         return offsets
@@ -314,6 +326,15 @@ def raster_grid(dataset: Any, path: Path) -> RasterGrid:
         return RasterGrid(dataset.width, dataset.height, t.c, t.f, t.a, t.e)
     except ValueError as err:
         raise MapError(f"{path}: {err}; straighten it with gdalwarp") from err
+
+
+def _levels(dataset: Any, path: Path) -> list[int]:
+    """Levels of a rasterio dataset: 0 and its overviews. Raises: MapError for other than powers of two."""
+    factors: list[int] = [1, *dataset.overviews(1)]
+    levels = [factor.bit_length() - 1 for factor in factors]
+    if factors != [2**level for level in levels]:
+        raise MapError(f"{path}: overviews of {factors[1:]} pixels, expected powers of 2; rebuild the pack")
+    return levels
 
 
 @contextmanager

@@ -15,7 +15,7 @@ Bounds = tuple[float, float, float, float]
 # Tiles at the rim of a pack are cropped to whole steps of this, so that the pixels of every overview are exactly
 # 2^k of the full ones, in every tile.
 CROP_PX = 64
-# Full resolution and the overviews 2, 4, 8, 16.
+# Full resolution and pixels of 2, 4, 8, 16 times its side.
 LEVELS = 5
 _MIN_TILE_PX, _MAX_TILE_PX = 512, 4096
 _TILE_SIDE_M = 800.0
@@ -42,7 +42,7 @@ class Lattice(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         west, top: map coordinates, m, of the outer corner of pixel (0, 0), the corner of a tile.
         pixel_m: side of a pixel; columns run east, rows run south.
         tile_px: pixels per side of a tile.
-        levels: full resolution and overviews; level k has pixels of ``pixel_m * 2**k``.
+        levels: that can be read; level k has pixels of ``pixel_m * 2**k``.
     """
 
     west: float

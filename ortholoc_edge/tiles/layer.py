@@ -17,9 +17,13 @@ import numpy as np
 from ortholoc_edge.errors import MapError
 from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, ImageArray
 from ortholoc_edge.tiles.cog import Block, Cog, Handles, PixelWindow, UndecodableError, touched, within
+from ortholoc_edge.tiles.levels import halved_heights, halved_image, next_stored
 from ortholoc_edge.tiles.manifest import Dop, Dsm, FileNote, Tile, layer_box
 
 logger = logging.getLogger(__name__)
+
+# Finer pixels that a level which is not stored is averaged from at a time: a window in flight is one strip.
+_STRIP_PX = 4_000_000
 
 _Paste = Callable[[Cog, PixelWindow, tuple[slice, slice]], None]
 
@@ -45,7 +49,7 @@ class LoadedLayer:
     """DOP or DSM of a pack, preloaded. Safe to read from several threads.
 
     Attributes:
-        grids: of the levels over the box that holds all tiles, finest first.
+        grids: of the levels, stored or not, over the box that holds all tiles, finest first.
         damaged: files that are holes or have some, in the order in which that was found.
     """
 
@@ -61,7 +65,7 @@ class LoadedLayer:
                 forged block a CRC-32 can be made to fit.
         Raises: MapError if not one tile can be used.
         """
-        self._lattice = layer.lattice
+        self._layer, self._lattice = layer, layer.lattice
         self._box = layer_box(layer.tiles)
         self.grids = tuple(layer.lattice.grid(self._box, level) for level in range(layer.lattice.levels))
         self.damaged: list[str] = []
@@ -96,6 +100,34 @@ class LoadedLayer:
 
     def read_image(self, level: int, window: PixelWindow) -> tuple[ImageArray, BoolArray]:
         """RGB (H, W, 3) uint8 and validity (H, W) of a window inside a level of a DOP."""
+        stored = next_stored(self._layer.stored, level)
+        if stored == level:
+            return self._stored_image(level, window)
+        rgb = np.empty((window.height, window.width, 3), dtype=np.uint8)
+        valid = np.empty((window.height, window.width), dtype=np.bool_)
+        for rows, finer in _strips(window, level - stored):
+            part = self._stored_image(stored, finer)
+            for _ in range(level - stored):
+                part = halved_image(*part)
+            rgb[rows], valid[rows] = part
+        return rgb, valid
+
+    def read_heights(self, level: int, window: PixelWindow) -> Float32Array:
+        """Heights (H, W) float32 of a window inside a level of a DSM, NaN where there is no data."""
+        stored = next_stored(self._layer.stored, level)
+        if stored == level:
+            return self._stored_heights(level, window)
+        heights = np.empty((window.height, window.width), dtype=np.float32)
+        for rows, finer in _strips(window, level - stored):
+            part, share = self._stored_heights(stored, finer), None
+            for _ in range(level - stored):
+                part, share = halved_heights(part, share)
+            heights[rows] = part
+        return heights
+
+    # -- reading ---------------------------------------------------------------------------------------
+
+    def _stored_image(self, level: int, window: PixelWindow) -> tuple[ImageArray, BoolArray]:
         rgb = np.zeros((window.height, window.width, 3), dtype=np.uint8)
         valid = np.zeros((window.height, window.width), dtype=np.bool_)
 
@@ -107,8 +139,7 @@ class LoadedLayer:
         self._assemble(level, window, paste)
         return rgb, valid
 
-    def read_heights(self, level: int, window: PixelWindow) -> Float32Array:
-        """Heights (H, W) float32 of a window inside a level of a DSM, NaN where there is no data."""
+    def _stored_heights(self, level: int, window: PixelWindow) -> Float32Array:
         heights = np.full((window.height, window.width), np.nan, dtype=np.float32)
 
         def paste(cog: Cog, piece: PixelWindow, place: tuple[slice, slice]) -> None:
@@ -116,8 +147,6 @@ class LoadedLayer:
 
         self._assemble(level, window, paste)
         return heights
-
-    # -- reading ---------------------------------------------------------------------------------------
 
     def _assemble(self, level: int, window: PixelWindow, paste: _Paste) -> None:
         """Paste what each tile has of a window; where none has anything the target stays as it is."""
@@ -200,8 +229,7 @@ class LoadedLayer:
             self.damaged.append(held.note.file)
 
     def _require(self, held: _Held) -> None:
-        grids = [self._lattice.grid(held.note.box, level) for level in range(self._lattice.levels)]
-        held.cog.require(grids, self._dtypes, self._nodata)
+        held.cog.require(self._layer.tile_grids(held.note), self._dtypes, self._nodata)
 
     # -- loading ---------------------------------------------------------------------------------------
 
@@ -233,6 +261,20 @@ class LoadedLayer:
             path, len(held.damaged),
         )  # fmt: skip
         return held
+
+
+def _strips(window: PixelWindow, steps: int) -> Iterator[tuple[slice, PixelWindow]]:
+    """A window in strips, each as its rows and as the window of the level ``steps`` finer that it is averaged from.
+
+    A reader's limit is on what it asks for; of the finer pixels, 4 or 16 times as many, few are held at a time.
+    """
+    count = max(_STRIP_PX // (window.width << 2 * steps), 1)
+    for row in range(0, window.height, count):
+        height = min(count, window.height - row)
+        yield (
+            slice(row, row + height),
+            PixelWindow(window.column << steps, (window.row + row) << steps, window.width << steps, height << steps),
+        )
 
 
 def read_listed(path: Path, note: FileNote) -> bytes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, TypeVar
 
@@ -11,13 +11,16 @@ import msgspec
 import numpy as np
 
 from ortholoc_edge.errors import MapError
+from ortholoc_edge.geometry.grid import RasterGrid
 from ortholoc_edge.tiles.georeference import HeightOffset, VerticalDatum
 from ortholoc_edge.tiles.lattice import CROP_PX, Bounds, Lattice, PixelBox
 
 MANIFEST_NAME = "manifest.json"
 SIGNATURE_NAME = "manifest.sig"
 FORMAT = "ortholoc-pack"
-VERSION = 2
+VERSION = 3
+# Version 2: every level is stored.
+_READ = (2, VERSION)
 
 _T = TypeVar("_T", bound=msgspec.Struct)
 
@@ -117,6 +120,8 @@ class Layer(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     Attributes:
         lattice: of the pixels.
+        stored_levels: that the tiles hold, 0 first; those between are averaged from the next finer one, see
+            `tiles.levels`. None: all.
         compression: of the TIFFs, for people.
         sources: that the layer was built from, newest first.
         date: of acquisition, where one holds for all.
@@ -129,6 +134,16 @@ class Layer(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     date: _Date | None = None
     attribution: str | None = None
     licence: str | None = None
+    stored_levels: Annotated[tuple[_Index, ...], msgspec.Meta(min_length=1)] | None = None
+
+    @property
+    def stored(self) -> tuple[int, ...]:
+        """Levels that the tiles hold, 0 first."""
+        return tuple(range(self.lattice.levels)) if self.stored_levels is None else self.stored_levels
+
+    def tile_grids(self, tile: Tile) -> dict[int, RasterGrid]:
+        """Grids of a tile by stored level."""
+        return {level: self.lattice.grid(tile.box, level) for level in self.stored}
 
     @property
     def gsd_m(self) -> float:
@@ -291,9 +306,9 @@ def parse_manifest(raw: bytes, path: Path) -> Manifest:
     head = _decoded(raw, _Head, path)
     if head.format != FORMAT:
         raise MapError(f"{path}: format {head.format!r} at $.format, expected {FORMAT!r}; is it an area pack?")
-    if head.version != VERSION:
+    if head.version not in _READ:
         raise MapError(
-            f"{path}: version {head.version} at $.version, this program reads {VERSION};"
+            f"{path}: version {head.version} at $.version, this program reads {' and '.join(map(str, _READ))};"
             " rebuild the pack with this program or update the program"
         )
     manifest = _decoded(raw, Manifest, path)
@@ -308,23 +323,7 @@ def _check(manifest: Manifest, path: Path) -> None:
         return MapError(f"{path}: {key}: {what}; rebuild the pack or copy it again")
 
     for name, layer in (("dop", manifest.dop), ("dsm", manifest.dsm)):
-        lattice, seen = layer.lattice, set()
-        if not np.isfinite([lattice.west, lattice.top, lattice.pixel_m]).all():
-            raise refuse(f"$.{name}.lattice", "not finite")
-        for index, tile in enumerate(layer.tiles):
-            key = f"$.{name}.tiles[{index}]"
-            first = lattice.tile_key(tile.column, tile.row)
-            if first != lattice.tile_key(tile.column + tile.width - 1, tile.row + tile.height - 1):
-                raise refuse(key, f"{tile.box} crosses a tile's border")
-            if first in seen:
-                raise refuse(key, f"a second tile at {first}")
-            seen.add(first)
-            if any(source >= len(layer.sources) for source in tile.sources):
-                raise refuse(f"{key}.sources", "names a source that is not listed")
-            try:
-                tile.crcs()
-            except ValueError as err:
-                raise refuse(f"{key}.segment_crc32", str(err)) from err
+        _check_layer(name, layer, refuse)
     if manifest.features is not None:
         for index, entry in enumerate(manifest.features.tiles):
             if entry.dop >= len(manifest.dop.tiles):
@@ -334,6 +333,28 @@ def _check(manifest: Manifest, path: Path) -> None:
         raise refuse("$", "names a file twice")
     if MANIFEST_NAME in names or SIGNATURE_NAME in names:
         raise refuse("$", f"lists {MANIFEST_NAME} or {SIGNATURE_NAME}")
+
+
+def _check_layer(name: str, layer: Dop | Dsm, refuse: Callable[[str, str], MapError]) -> None:
+    lattice, seen = layer.lattice, set()
+    if not np.isfinite([lattice.west, lattice.top, lattice.pixel_m]).all():
+        raise refuse(f"$.{name}.lattice", "not finite")
+    if layer.stored[0] != 0 or list(layer.stored) != sorted({*layer.stored} & {*range(lattice.levels)}):
+        raise refuse(f"$.{name}.stored_levels", f"not some of the {lattice.levels} levels in order from 0 on")
+    for index, tile in enumerate(layer.tiles):
+        key = f"$.{name}.tiles[{index}]"
+        first = lattice.tile_key(tile.column, tile.row)
+        if first != lattice.tile_key(tile.column + tile.width - 1, tile.row + tile.height - 1):
+            raise refuse(key, f"{tile.box} crosses a tile's border")
+        if first in seen:
+            raise refuse(key, f"a second tile at {first}")
+        seen.add(first)
+        if any(source >= len(layer.sources) for source in tile.sources):
+            raise refuse(f"{key}.sources", "names a source that is not listed")
+        try:
+            tile.crcs()
+        except ValueError as err:
+            raise refuse(f"{key}.segment_crc32", str(err)) from err
 
 
 def _decoded(raw: bytes, kind: type[_T], path: Path) -> _T:

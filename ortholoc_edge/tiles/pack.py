@@ -152,10 +152,9 @@ class Pack:
         intact = hashlib.sha256(data).hexdigest() == tile.sha256
         if not intact:
             yield f"{path}: SHA-256 differs from {MANIFEST_NAME}; copy the pack again"
-        grids = [layer.lattice.grid(tile.box, level) for level in range(layer.lattice.levels)]
         dtypes, nodata = (("float32",), layer.nodata) if isinstance(layer, Dsm) else (("uint8",) * 3, None)
         with Cog(data, path) as cog:
-            cog.require(grids, dtypes, nodata)
+            cog.require(layer.tile_grids(tile), dtypes, nodata)
             if cog.crs != crs:
                 yield f"{path}: its reference system is {cog.crs}, the manifest's is {self.manifest.crs}"
             if intact:

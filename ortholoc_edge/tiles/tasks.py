@@ -38,6 +38,7 @@ from ortholoc_edge.tiles.area import MapArea
 from ortholoc_edge.tiles.cog import Cog, quiet_georeference
 from ortholoc_edge.tiles.holes import fill_small_holes
 from ortholoc_edge.tiles.lattice import LEVELS, Lattice, PixelBox
+from ortholoc_edge.tiles.levels import STORED_LEVELS
 from ortholoc_edge.tiles.manifest import encode_crcs
 from ortholoc_edge.tiles.mosaic import dop_mosaic, dsm_mosaic
 from ortholoc_edge.tiles.prepare import prepare
@@ -46,7 +47,7 @@ from ortholoc_edge.tiles.sources import Source, fingerprint
 logger = logging.getLogger(__name__)
 
 # Part of every hash: raise it when the same input makes other bytes.
-_RECIPE = 2
+_RECIPE = 3
 _WORKER_CACHE_BYTES = 64 * 2**20
 _PR_SET_PDEATHSIG = 1
 _DASK_PATIENCE_S = 30.0
@@ -299,21 +300,21 @@ def _segments(data: bytes) -> str:
 
 
 def _check_dop(data: bytes, valid: BoolArray) -> None:
-    """Decode every level of what will be flown with, while the truth is at hand."""
+    """Decode every stored level of what will be flown with, while the truth is at hand."""
     with quiet_georeference(), MemoryFile(data) as memory:
-        for level in range(LEVELS):
-            with _level(memory, level) as dataset:
+        for number in range(len(STORED_LEVELS)):
+            with _stored(memory, number) as dataset:
                 dataset.read()
-                if level == 0 and not np.array_equal(dataset.dataset_mask() > 0, valid):
+                if number == 0 and not np.array_equal(dataset.dataset_mask() > 0, valid):
                     raise MapError("a compressed tile lost its mask; this GDAL is not fit to build, update rasterio")
 
 
 def _check_dsm(data: bytes, heights: Float32Array, max_z_error_m: float) -> None:
     with quiet_georeference(), MemoryFile(data) as memory:
-        for level in range(LEVELS):
-            with _level(memory, level) as dataset:
+        for number in range(len(STORED_LEVELS)):
+            with _stored(memory, number) as dataset:
                 found = dataset.read(1)
-            if level > 0:
+            if number > 0:
                 continue
             hole = np.isnan(heights)
             # Float32 at 9000 m resolves half a millimetre.
@@ -325,9 +326,9 @@ def _check_dsm(data: bytes, heights: Float32Array, max_z_error_m: float) -> None
                 )
 
 
-def _level(memory: MemoryFile, level: int) -> Any:
+def _stored(memory: MemoryFile, number: int) -> Any:
     try:
-        return memory.open() if level == 0 else memory.open(overview_level=level - 1)
+        return memory.open() if number == 0 else memory.open(overview_level=number - 1)
     except RasterioError as err:
         raise MapError(f"a compressed tile does not read back ({err}); update rasterio") from err
 

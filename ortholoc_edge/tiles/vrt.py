@@ -42,7 +42,7 @@ def mosaic(layer: Dop | Dsm, crs: str | None) -> bytes:
         _text(band, "ColorInterp", "Gray")
         band.extend(_sources(layer.tiles, box, "Float32", "1"))
     # They hold no pixels: GDAL reads the overviews of the tiles for them. Exact, since tiles nest on every level.
-    overviews = [str(2**level) for level in range(1, layer.lattice.levels)]
+    overviews = [str(2**level) for level in layer.stored[1:]]
     if overviews:
         _text(root, "OverviewList", " ".join(overviews))
     ET.indent(root)

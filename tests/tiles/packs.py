@@ -14,6 +14,7 @@ from ortholoc_edge.tiles import encode
 from ortholoc_edge.tiles.cog import Cog
 from ortholoc_edge.tiles.georeference import VerticalDatum
 from ortholoc_edge.tiles.lattice import LEVELS, Lattice, PixelBox
+from ortholoc_edge.tiles.levels import STORED_LEVELS
 from ortholoc_edge.tiles.manifest import (
     FORMAT,
     MANIFEST_NAME,
@@ -56,6 +57,7 @@ def write_pack(
     leave_out: frozenset[tuple[str, int, int]] = frozenset(),
     files: Mapping[str, bytes] | None = None,
     max_z_error_m: float = 0.01,
+    stored: tuple[int, ...] = STORED_LEVELS,
     **changes: Any,
 ) -> Pack:
     """Write a pack of lossless DOP tiles and DSM tiles.
@@ -67,6 +69,7 @@ def write_pack(
         offsets: (amsl, ellipsoid) by key of the DSM's tiles.
         leave_out: (layer, column, row) of tiles that the pack does not have, counted in tiles.
         files: others, to be written and listed.
+        stored: levels that the tiles hold.
         changes: of the manifest.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -77,7 +80,7 @@ def write_pack(
         if ("dop", *dop_lattice.tile_key(tile.column, tile.row)) in leave_out:
             continue
         at = _slices(tile, dop_corner)
-        data = encode.dop_cog(rgb[:, *at], valid[at], dop_lattice.grid(tile), crs, "webp", 100)
+        data = encode.dop_cog(rgb[:, *at], valid[at], dop_lattice.grid(tile), crs, "webp", 100, stored)
         dop_tiles.append(
             DopTile(
                 **_note(folder, f"dop/{dop_lattice.tile_name(tile)}.tif", data),
@@ -91,7 +94,7 @@ def write_pack(
         if ("dsm", *key) in leave_out:
             continue
         part = heights[_slices(tile, dsm_corner)]
-        data = encode.dsm_cog(part, dsm_lattice.grid(tile), crs, max_z_error_m)
+        data = encode.dsm_cog(part, dsm_lattice.grid(tile), crs, max_z_error_m, stored)
         known = part[np.isfinite(part)]
         amsl, ellipsoid = (offsets or {}).get(key, (None, None))
         dsm_tiles.append(
@@ -114,10 +117,15 @@ def write_pack(
         "anchor": (round((west + east) / 2, -1), round((south + north) / 2, -1)),
         "vertical": vertical,
         "dop": Dop(
-            lattice=dop_lattice, compression="WEBP lossless", sources=[SourceNote(name="dop.tif")], tiles=dop_tiles
+            lattice=dop_lattice,
+            stored_levels=stored,
+            compression="WEBP lossless",
+            sources=[SourceNote(name="dop.tif")],
+            tiles=dop_tiles,
         ),
         "dsm": Dsm(
             lattice=dsm_lattice,
+            stored_levels=stored,
             compression="LERC_ZSTD",
             sources=[SourceNote(name="dsm.tif")],
             tiles=dsm_tiles,

@@ -13,6 +13,7 @@ from ortholoc_edge.tiles.alignment import consensus, correlations, find_peak, me
 from ortholoc_edge.tiles.encode import NODATA, dop_cog, dsm_cog
 from ortholoc_edge.tiles.georeference import Georeference
 from ortholoc_edge.tiles.lattice import Lattice, PixelBox
+from ortholoc_edge.tiles.levels import STORED_LEVELS
 from ortholoc_edge.tiles.manifest import (
     FORMAT,
     VERSION,
@@ -84,7 +85,13 @@ def write(folder, grey, dsm_tiles, dsm_lattice, dsm_sources=()):
     box = PixelBox(0, 0, side, side)
     rgb = np.repeat(grey[None], 3, axis=0)
     data = dop_cog(rgb, np.ones(grey.shape, dtype=bool), dop_lattice.grid(box), CRS, quality=85)
-    dop = Dop(lattice=dop_lattice, compression="webp", sources=[], tiles=[DopTile(**note("dop/a.tif", data, box))])
+    dop = Dop(
+        lattice=dop_lattice,
+        stored_levels=STORED_LEVELS,
+        compression="webp",
+        sources=[],
+        tiles=[DopTile(**note("dop/a.tif", data, box))],
+    )
     tiles = []
     for k, (place, heights, sources) in enumerate(dsm_tiles):
         data = dsm_cog(heights, dsm_lattice.grid(place), CRS, 0.01)
@@ -92,6 +99,7 @@ def write(folder, grey, dsm_tiles, dsm_lattice, dsm_sources=()):
         tiles.append(DsmTile(**entry, sources=sources, min_m=float(heights.min()), max_m=float(heights.max())))
     dsm = Dsm(
         lattice=dsm_lattice,
+        stored_levels=STORED_LEVELS,
         compression="lerc_zstd",
         sources=list(dsm_sources),
         tiles=tiles,

@@ -81,7 +81,7 @@ def test_round_trip(pack, tmp_path):
     write_manifest(pack.manifest, tmp_path / MANIFEST_NAME)
     manifest = read_manifest(tmp_path / MANIFEST_NAME)
     assert manifest == pack.manifest
-    assert all(len(tile.crcs()) == 6 for tile in (*manifest.dop.tiles, *manifest.dsm.tiles))  # head and 5 levels
+    assert all(len(tile.crcs()) == 4 for tile in (*manifest.dop.tiles, *manifest.dsm.tiles))  # head and 3 levels
     assert layer_bounds(manifest.dsm) == (400_000.0, 5_299_936.0, 400_064.0, 5_300_000.0)
     assert layer_bounds(manifest.dop) == (400_000.0, 5_299_968.0, 400_064.0, 5_300_000.0)
     assert valid_fraction(manifest.dsm) == pytest.approx(1 - 200 / 4096)
@@ -91,7 +91,7 @@ def test_round_trip(pack, tmp_path):
     ("change", "message"),
     [
         (lambda m: m.update(version=1), r"version 1 at \$\.version.*rebuild the pack"),
-        (lambda m: m.update(version=3), r"version 3 at \$\.version"),
+        (lambda m: m.update(version=4), r"version 4 at \$\.version"),
         (lambda m: m.update(version="2"), r"\$\.version"),
         (lambda m: m.update(format="mbtiles"), r"\$\.format"),
         (lambda m: m.pop("format"), "format"),
@@ -112,6 +112,12 @@ def test_round_trip(pack, tmp_path):
         (lambda m: m["dop"]["tiles"][1].update(sources=[7]), r"\$\.dop\.tiles\[1\]\.sources"),
         (lambda m: m["dop"]["lattice"].update(pixel_m=0), r"\$\.dop\.lattice\.pixel_m"),
         (lambda m: m["dop"]["lattice"].update(pixel_m=1e-200), "pixels of 1e-200 m"),
+        (lambda m: m["dop"].update(stored_levels=[]), r"\$\.dop\.stored_levels"),
+        (lambda m: m["dop"].update(stored_levels=[1, 2]), r"\$\.dop\.stored_levels.*of the 5 levels"),
+        (lambda m: m["dsm"].update(stored_levels=[0, 4, 2]), r"\$\.dsm\.stored_levels.*of the 5 levels"),
+        (lambda m: m["dsm"].update(stored_levels=[0, 2, 5]), r"\$\.dsm\.stored_levels.*of the 5 levels"),
+        (lambda m: m["dsm"].update(stored_levels=[0, 2, 2]), r"\$\.dsm\.stored_levels.*of the 5 levels"),
+        (lambda m: m["dsm"]["lattice"].update(levels=4), r"\$\.dsm\.stored_levels.*of the 4 levels"),
         (lambda m: m["dsm"]["lattice"].update(tile_px=100), r"\$\.dsm\.lattice\.tile_px"),
         (lambda m: m["vertical"].update(kind="baro"), r"\$\.vertical\.kind"),
         (lambda m: m["vertical"].update(amsl_sigma_m=-1.0), r"vertical\.amsl_sigma_m"),
@@ -179,8 +185,14 @@ def restate(folder, index, **fields):
         (lambda f, p: restate(f, 1, segment_crc32=p.manifest.dop.tiles[0].segment_crc32), ["segment_crc32"]),
         (lambda f, p: edit(f, lambda m: m.update(crs="EPSG:32632", anchor=[400_030, 5_299_960])), ["32633"] * 3),
         (lambda f, p: edit(f, lambda m: m["dsm"].update(nodata=-1.0)), [r"dsm/\S+: nodata -9999"]),
-        (lambda f, p: edit(f, lambda m: m["dsm"]["lattice"].update(west=399_999.0)), [r"dsm/\S+: .*expected 5 of"]),
-        (lambda f, p: edit(f, lambda m: m["dop"]["lattice"].update(levels=4)), [r"dop/\S+: 5 levels.*expected 4"] * 2),
+        (
+            lambda f, p: edit(f, lambda m: m["dsm"]["lattice"].update(west=399_999.0)),
+            [r"dsm/\S+: levels \[0, 2, 4\] of .*399999"],
+        ),
+        (
+            lambda f, p: edit(f, lambda m: m["dop"].pop("stored_levels")),
+            [r"levels \[0, 2, 4\] of.*expected \[0, 1, 2, 3, 4\]"] * 2,
+        ),
     ],
 )  # fmt: skip
 def test_every_fault_is_named(copied, pack, fault, problems):
@@ -240,7 +252,7 @@ def mutated(raw, rng):
     else:
         old = holder.pop(key)
         if isinstance(holder, dict):
-            holder[rng.choice(["file", "column", "nodata", "levels", "width", "zzz"])] = old
+            holder[rng.choice(["file", "column", "nodata", "levels", "stored_levels", "width", "zzz"])] = old
     return json.dumps(content).encode()
 
 

@@ -21,6 +21,7 @@ from ortholoc_edge.geometry.grid import bilinear
 from ortholoc_edge.tiles import encode, store
 from ortholoc_edge.tiles.cog import MAX_HANDLES, Cog, PixelWindow
 from ortholoc_edge.tiles.lattice import LEVELS, PixelBox
+from ortholoc_edge.tiles.levels import STORED_LEVELS, halved_heights, halved_image
 from ortholoc_edge.tiles.manifest import MANIFEST_NAME, FeatureLayer, FeatureTile, write_manifest
 from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.store import MapStore, WindowTooLargeError
@@ -80,6 +81,24 @@ def same(a, b):
     return np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
 
 
+def finer(window):
+    return PixelWindow(*(2 * value for value in window))
+
+
+def averaged_image(one, level, window):
+    """What a COG has of a level, or the mean of the next finer one: RGB (H, W, 3) and validity."""
+    if level in one.grids:
+        bands, mask = one.read_image(level, window)
+        return np.moveaxis(bands, 0, -1), mask
+    return halved_image(*averaged_image(one, level - 1, finer(window)))
+
+
+def averaged_heights(one, level, window):
+    if level in one.grids:
+        return one.read_heights(level, window)
+    return halved_heights(averaged_heights(one, level - 1, finer(window)))[0]
+
+
 def everything(opened, level=0):
     """(DOP, validity, DSM) of all tiles."""
     dop, dsm = opened.dop_grids[level], opened.dsm_grids[level]
@@ -112,17 +131,17 @@ def test_scene_is_cut_into_tiles_whose_rims_are_cropped(pack, sound):
 def test_any_window_is_that_of_the_whole_raster(sound, whole, data, level):
     for opened, one, grids in ((sound._dop, whole[0], sound.dop_grids), (sound._dsm, whole[1], sound.dsm_grids)):
         grid = grids[level]
-        assert one.grids[level] == grid
+        assert level not in one.grids or one.grids[level] == grid
         column, row = data.draw(st.integers(0, grid.width - 1)), data.draw(st.integers(0, grid.height - 1))
         width = data.draw(st.integers(1, grid.width - column))
         window = PixelWindow(column, row, width, data.draw(st.integers(1, grid.height - row)))
         if one is whole[0]:
             rgb, valid = opened.read_image(level, window)
-            bands, mask = one.read_image(level, window)
+            expected, mask = averaged_image(one, level, window)
             assert same(valid, mask)
-            assert same(rgb[valid], np.moveaxis(bands, 0, -1)[mask])
+            assert same(rgb[valid], expected[mask])
         else:
-            assert same(opened.read_heights(level, window), one.read_heights(level, window))
+            assert same(opened.read_heights(level, window), averaged_heights(one, level, window))
 
 
 @settings(max_examples=100, deadline=None)
@@ -364,7 +383,7 @@ def tile_of(pack, layer, column, row):
 
 def offset_of(path, column=0, row=0, level=0):
     with MemoryFile(path.read_bytes()) as memory, memory.open() as dataset:
-        ovr = level - 1 if level else None
+        ovr = STORED_LEVELS.index(level) - 1 if level else None
         return int(dataset.get_tag_item(f"BLOCK_OFFSET_{column}_{row}", "TIFF", bidx=1, ovr=ovr))
 
 
@@ -423,17 +442,18 @@ def test_tile_that_cannot_be_used_is_a_hole(copied, pack, sound, layer, fault, c
         MapStore(Pack.open(copied), require_intact=True)
 
 
-def test_of_a_damaged_tile_only_the_bad_block_is_a_hole(copied, pack, sound, caplog):
-    """Level 1 of a tile: the other levels of the same tile are still used."""
+@pytest.mark.parametrize(("bad", "lost_levels"), [(0, {0, 1}), (2, {2, 3}), (4, {4})])
+def test_of_a_damaged_tile_only_the_bad_block_is_a_hole(copied, pack, sound, caplog, bad, lost_levels):
+    """And what is averaged from it: the other levels of the same tile are still used."""
     for layer in ("dop", "dsm"):
         tile = tile_of(pack, layer, 1, 1)
-        flip(copied / tile.file, offset_of(copied / tile.file, level=1) + 40)
+        flip(copied / tile.file, offset_of(copied / tile.file, level=bad) + 40)
     with MapStore(Pack.open(copied)) as opened:
         assert len(opened.damaged) == 2
         assert [("1 blocks are holes" in text) for text in warnings_of(caplog)] == [True, True]
         for level in range(LEVELS):
             lost = assert_only_holes(opened, sound, level)
-            assert (lost[0] > 0, lost[1] > 0) == (level == 1, level == 1)
+            assert (lost[0] > 0, lost[1] > 0) == (level in lost_levels, level in lost_levels)
 
 
 def test_missing_files_give_one_line_and_a_count(copied, pack, caplog):
