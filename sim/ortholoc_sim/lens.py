@@ -10,6 +10,7 @@ import numpy as np
 from ortholoc_edge.geometry.arrays import Float32Array, ImageArray
 from ortholoc_edge.geometry.camera import Camera
 
+_MID_GREY = 112.0
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 
 
@@ -19,6 +20,7 @@ class Exposure:
 
     Attributes:
         gain: exposure, on the values of the picture.
+        metering: how far the camera brings a picture's mean to mid grey by itself: 0 not at all, 1 all the way.
         white: white balance, factors of red, green, blue.
         gamma: of the tone curve; above 1 darkens the middle tones.
         contrast: about mid grey.
@@ -31,6 +33,7 @@ class Exposure:
     """
 
     gain: float
+    metering: float
     white: tuple[float, float, float]
     gamma: float
     contrast: float
@@ -59,6 +62,7 @@ class Exposure:
         white = white * (1.0 + spread * shot.normal(0.0, 0.015, 3))
         return cls(
             gain,
+            0.0 if mild else float(camera.uniform(0.5, 0.9)),
             (float(white[0]), float(white[1]), float(white[2])),
             gamma,
             float(contrast),
@@ -79,7 +83,8 @@ class Exposure:
         u = (np.arange(camera.width, dtype=np.float32) - np.float32(camera.cx)) / np.float32(camera.fx)
         v = (np.arange(camera.height, dtype=np.float32) - np.float32(camera.cy)) / np.float32(camera.fy)
         r2 = u[None] ** 2 + v[:, None] ** 2
-        light = np.float32(self.gain / 255.0) * (1.0 - np.float32(self.vignetting) * r2 / r2.max())
+        gain = self.gain * (_MID_GREY / max(1.0, float(image.mean()))) ** self.metering
+        light = np.float32(gain / 255.0) * (1.0 - np.float32(self.vignetting) * r2 / r2.max())
         image *= light[..., None] * np.array(self.white, dtype=np.float32)
         np.clip(image, 0.0, 1.0, out=image)
         if self.gamma != 1.0:

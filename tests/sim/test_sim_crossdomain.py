@@ -21,7 +21,9 @@ from ortholoc_sim.crossdomain import (
     survey_layout,
     write_set,
 )
+from ortholoc_sim.detail import Detail
 from ortholoc_sim.layout import Building
+from ortholoc_sim.lens import Exposure
 from ortholoc_sim.season import other_time, survey_time
 from ortholoc_sim.world import Scene, WorldSpec, base_height
 
@@ -35,6 +37,10 @@ from ortholoc_edge.tiles.store import MapStore
 SMALL = CrossDomain(Kind.XDOP, seed=5, width_m=560.0, height_m=520.0, gsd_m=0.25)
 SAME, OLD = replace(SMALL, kind=Kind.SAME), replace(SMALL, kind=Kind.XDOPDSM)
 COUNT = 12
+
+
+def rng(seed: int) -> np.random.Generator:
+    return np.random.default_rng(seed)
 
 
 @pytest.fixture(scope="module")
@@ -66,12 +72,12 @@ def project(domain: CrossDomain, pose: Rigid3, local: FloatArray) -> FloatArray:
 
 def test_photo_shows_what_a_plain_ray_cast_hits(flown: Scene, views: list[tuple[Rigid3, View]]) -> None:
     """The march in small steps of double precision, without the renderer's grids of maxima."""
-    rng = np.random.default_rng(0)
+    lot = rng(0)
     place, grid = SMALL.placement, flown.spec.grid
     surface = flown.surface
     errors = []
     for pose, view in views:
-        px = np.stack([rng.integers(0, WIDTH_PX, 60), rng.integers(0, HEIGHT_PX, 60)], axis=1)
+        px = np.stack([lot.integers(0, WIDTH_PX, 60), lot.integers(0, HEIGHT_PX, 60)], axis=1)
         rays = np.column_stack([(px - ((WIDTH_PX - 1) / 2, (HEIGHT_PX - 1) / 2)) / SMALL.camera.fx, np.ones(60)])
         world = rays @ pose.rotation.T
         world = world / -world[:, 2:] * np.array([place.grid_scale, place.grid_scale, 1.0])
@@ -254,8 +260,7 @@ def test_renderer_hits_the_surface_at_any_texel(gsd_m: float) -> None:
     """Cells of the grids of maxima are whole texels: at 0.2 m they were taken for larger than they are, and rays
     passed under the surface."""
     spec = WorldSpec(0, 120.0, 120.0, gsd_m)
-    rng = np.random.default_rng(1)
-    surface = cv2.GaussianBlur(rng.normal(0.0, 60.0, spec.shape).astype(np.float32), (0, 0), 3.0 / gsd_m)
+    surface = cv2.GaussianBlur(rng(1).normal(0.0, 60.0, spec.shape).astype(np.float32), (0, 0), 3.0 / gsd_m)
     ids = np.zeros(spec.shape, np.uint16)
     scene = Scene(spec, SMALL.survey, np.zeros((*spec.shape, 3), np.uint8), surface, surface, ids, (), (), ())
     pose = replace(SMALL).poses(1)[0]
@@ -326,6 +331,51 @@ def test_photo_of_the_map_s_own_time_fits_the_map_to_the_pixel(tmp_path: Path) -
     assert len(shifts) >= 8
     assert np.abs(np.median(shifts, axis=0)).max() < 0.15
     assert np.median(np.linalg.norm(shifts, axis=1)) < 0.4
+
+
+def exposures(count: int, mild: bool) -> list[Exposure]:
+    return [Exposure.drawn(np.random.default_rng(1), np.random.default_rng(k), mild) for k in range(count)]
+
+
+def test_lens_smears_a_point_but_leaves_it_in_its_place() -> None:
+    dark = replace(exposures(1, True)[0], noise=0.0, shot=0.0, gain=1.0)
+    clean = np.zeros((HEIGHT_PX, WIDTH_PX, 3), np.uint8)
+    clean[198:203, 298:303] = 255
+    for motion_rad in (0.0, 0.7, 2.4):
+        smeared = replace(dark, motion_px=3.0, motion_rad=motion_rad).expose(clean, SMALL.camera, rng(0))
+        moments = cv2.moments(smeared[..., 1])
+        assert moments["m10"] / moments["m00"] == pytest.approx(300.0, abs=0.05)
+        assert moments["m01"] / moments["m00"] == pytest.approx(200.0, abs=0.05)
+        assert smeared.max() < 255
+
+
+def test_camera_of_the_map_s_time_is_milder_than_another() -> None:
+    """Photos of one clean picture, after the settings that vary from photo to photo."""
+    clean = np.tile(np.array([150, 90, 60], np.uint8), (HEIGHT_PX, WIDTH_PX, 1))
+    for mild in (True, False):
+        seen = np.array([e.expose(clean, SMALL.camera, rng(k)).mean(axis=(0, 1)) for k, e in
+                         enumerate(exposures(12, mild))])  # fmt: skip
+        hue = seen[:, 0] / seen[:, 2] / (150 / 60)
+        assert (np.abs(hue - 1.0).max() < 0.02) == mild
+    noise = exposures(1, True)[0].expose(clean, SMALL.camera, rng(0))[..., 1].astype(float)
+    assert 0.8 < (noise - cv2.GaussianBlur(noise, (0, 0), 8)).std() < 8.0
+
+
+def test_detail_is_tied_to_places_and_gone_from_high_up() -> None:
+    detail, flat = Detail(1, False), np.full((HEIGHT_PX, WIDTH_PX, 3), 128, np.uint8)
+    u, v = np.meshgrid(np.arange(WIDTH_PX), np.arange(HEIGHT_PX))
+    none = np.zeros(u.shape)
+
+    def seen(gsd_m: float, shift_px: int) -> FloatArray:
+        points = np.stack([(u + shift_px) * gsd_m, v * -gsd_m, none], axis=-1)
+        view = View(flat, points, none.astype(np.uint16), none > 0)
+        return detail.added(view, np.zeros(2), gsd_m).astype(float) - 128.0
+
+    low = seen(0.08, 0)
+    assert 2.0 < low.std() < 20.0
+    assert abs(low.mean()) < 1.0
+    assert np.abs(low[:, 10:] - seen(0.08, 10)[:, :-10]).max() <= 1.0
+    assert not seen(0.5, 0).any()
 
 
 def test_too_small_a_place_is_refused() -> None:
