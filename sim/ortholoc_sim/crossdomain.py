@@ -39,7 +39,7 @@ from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.grid import RasterGrid
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.tiles.georeference import Georeference, VerticalDatum
-from ortholoc_sim.camera import Placement, Renderer, Sensor
+from ortholoc_sim.camera import Placement, Renderer, Sensor, View
 from ortholoc_sim.country import FRAME
 from ortholoc_sim.detail import Detail
 from ortholoc_sim.epoch import Epoch
@@ -48,7 +48,7 @@ from ortholoc_sim.lens import Exposure
 from ortholoc_sim.photos import COLUMNS, flight_row
 from ortholoc_sim.place import Place, make_place, rotated_crops
 from ortholoc_sim.season import Moment, epoch_at, other_time, survey_time
-from ortholoc_sim.world import Scene, WorldSpec, build_scene
+from ortholoc_sim.world import FIRST_TREE, Cover, Scene, WorldSpec, build_scene
 
 DOP_GSD_M, DSM_GSD_M = 0.2, 1.0
 WIDTH_PX, HEIGHT_PX = 640, 480
@@ -71,6 +71,7 @@ _REPAINTED = 0.25
 _DSM_SIGMA_M, _OLD_DSM_SIGMA_M = 0.05, 0.3
 _OLD_DSM_BLUR_M = 1.2
 _DOP_JPEG_QUALITY = 90
+_LASTING = (Cover.YARD, Cover.GRAVEL, Cover.ASPHALT, Cover.STREET, Cover.SHORE)
 
 _Thing = TypeVar("_Thing")
 
@@ -96,6 +97,20 @@ class MapLayers:
     dop_grid: RasterGrid
     dsm: Float32Array
     dsm_grid: RasterGrid
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Photo:
+    """A photo of a flight.
+
+    Attributes:
+        image: (480, 640, 3) uint8 RGB.
+        lasting_share: of its pixels, those that show what looks alike at all times: houses, ways, yards, shores. In a
+            photo with next to none of them the plants alone would have to match.
+    """
+
+    image: ImageArray
+    lasting_share: float
 
 
 @dataclass(frozen=True)
@@ -209,13 +224,22 @@ class CrossDomain:
         """Of clean pictures: the sensor's flaws are `Exposure`'s."""
         return Renderer(scene, self.placement, Sensor(1.0, 0.0, 0.0, 0.0, 0))
 
-    def photo(self, renderer: Renderer, map_from_camera: Rigid3, index: int) -> ImageArray:
-        """(480, 640, 3) uint8 RGB: photo ``index`` of the flight, before JPEG."""
+    def photo(self, renderer: Renderer, map_from_camera: Rigid3, index: int) -> Photo:
+        """Photo ``index`` of the flight, before JPEG."""
         view = renderer.view(self.camera, map_from_camera)
         eye, axis = map_from_camera.translation, map_from_camera.rotation[:, 2]
         distance_m = (eye[2] - float(np.nanmedian(view.points_map[..., 2]))) / -axis[2]
         clean = self._detail.added(view, np.array([self.place.west_m, self.place.south_m]), distance_m / self.camera.fx)
-        return self.exposure(index).expose(clean, self.camera, np.random.default_rng([self.seed, 113, index]))
+        image = self.exposure(index).expose(clean, self.camera, np.random.default_rng([self.seed, 113, index]))
+        return Photo(image, self._lasting_share(view))
+
+    def _lasting_share(self, view: View) -> float:
+        world = self.place.world
+        local = view.points_map[..., :2] - (self.place.west_m, self.place.south_m)
+        u, v = np.round(world.spec.grid.px_from_map(local)).astype(int).transpose(2, 0, 1)
+        cover = world.cover[np.clip(v, 0, world.cover.shape[0] - 1), np.clip(u, 0, world.cover.shape[1] - 1)]
+        house = (view.objects > 0) & (view.objects < FIRST_TREE)
+        return float((house | ((view.objects == 0) & np.isin(cover, _LASTING))).mean())
 
     def exposure(self, index: int) -> Exposure:
         """The camera of the flight with the settings of one photo."""
@@ -302,6 +326,8 @@ def _kept(things: tuple[_Thing, ...], mask: BoolArray) -> tuple[_Thing, ...]:
 def write_set(out: Path, domain: CrossDomain, count: int, progress: bool = False) -> None:
     """Write map, photos and flight table to ``out``; the files are named after the folder.
 
+    The table has a column of its own, ``lasting_share`` (`Photo`), to tell photos with little to match apart.
+
     Raises: ValueError as `CrossDomain.poses`.
     """
     poses = domain.poses(count)
@@ -316,15 +342,16 @@ def write_set(out: Path, domain: CrossDomain, count: int, progress: bool = False
     start = datetime(2024, 1, 1) + timedelta(days=domain.flown.season.day - 1, hours=9)
     with (out / f"{name}_flight.csv").open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
-        table.writerow(COLUMNS)
+        table.writerow((*COLUMNS, "lasting_share"))
         for k, pose in enumerate(tqdm(poses, disable=not progress, unit="photo")):
-            photo = f"queries/{name}_{k:04d}.jpg"
+            filename = f"queries/{name}_{k:04d}.jpg"
             quality = domain.exposure(k).jpeg_quality
-            image = domain.photo(renderer, pose, k)
-            cv2.imwrite(str(out / photo), image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+            photo = domain.photo(renderer, pose, k)
+            cv2.imwrite(str(out / filename), photo.image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
             # Minutes apart: every photo stands for itself.
             when = start + timedelta(minutes=k)
-            table.writerow(flight_row(photo, when, pose, domain.camera, domain.georeference))
+            row = flight_row(filename, when, pose, domain.camera, domain.georeference)
+            table.writerow([*row, f"{photo.lasting_share:.4f}"])
 
 
 def _write_layers(out: Path, name: str, layers: MapLayers) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from ortholoc_sim.detail import Detail
 from ortholoc_sim.layout import Building
 from ortholoc_sim.lens import Exposure
 from ortholoc_sim.season import other_time, survey_time
-from ortholoc_sim.world import Scene, WorldSpec, base_height
+from ortholoc_sim.world import FIRST_PARCEL, FIRST_TREE, Scene, WorldSpec, base_height
 
 from ortholoc_edge.bench import sequence
 from ortholoc_edge.geometry.arrays import FloatArray
@@ -160,7 +161,7 @@ def test_same_seed_same_photos_other_seed_other_place(flown: Scene) -> None:
     np.testing.assert_array_equal(scene.texture, flown.texture)
     pose, other = SMALL.poses(1)[0], again.poses(1)[0]
     np.testing.assert_array_equal(pose.translation, other.translation)
-    photos = [d.photo(d.renderer(s), pose, 0) for d, s in ((SMALL, flown), (again, scene))]
+    photos = [d.photo(d.renderer(s), pose, 0).image for d, s in ((SMALL, flown), (again, scene))]
     np.testing.assert_array_equal(*photos)
     elsewhere = replace(SMALL, seed=6).place.world.layout.buildings
     assert {(b.x_m, b.y_m) for b in elsewhere}.isdisjoint({(b.x_m, b.y_m) for b in SMALL.place.world.layout.buildings})
@@ -293,6 +294,20 @@ def test_sun_stands_where_the_almanac_has_it() -> None:
     assert morning[1] == pytest.approx(17.8, abs=0.5)
 
 
+def test_lasting_share_counts_houses_and_ways(flown: Scene, views: list[tuple[Rigid3, View]]) -> None:
+    renderer = SMALL.renderer(flown)
+    shares = [SMALL.photo(renderer, pose, k).lasting_share for k, (pose, _) in enumerate(views)]
+    assert 0.0 <= min(shares) < max(shares) < 0.7
+    for share, (_, view) in zip(shares, views, strict=True):
+        assert share >= ((view.objects > 0) & (view.objects < FIRST_TREE)).mean()
+    # A place with nothing but plants has nothing that lasts.
+    bare = replace(SMALL)
+    world = replace(SMALL.place.world, cover=np.full_like(SMALL.place.world.cover, FIRST_PARCEL))
+    vars(bare)["place"] = replace(SMALL.place, world=world)
+    empty = replace(flown, objects=np.zeros_like(flown.objects))
+    assert bare.photo(bare.renderer(empty), views[0][0], 0).lasting_share == 0.0
+
+
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sets") / "town"
@@ -309,6 +324,8 @@ def test_written_set_is_read_as_a_flight_with_its_map(written: Path, tmp_path: P
         np.testing.assert_allclose(frame.ned_from_body, sequence.attitude_of(pose, convergence), atol=1e-7)
         assert frame.image().shape == (HEIGHT_PX, WIDTH_PX, 3)
         assert frame.camera == SMALL.camera
+    with (written / "town_flight.csv").open(encoding="utf-8", newline="") as table:
+        assert all(0.0 <= float(row["lasting_share"]) < 1.0 for row in csv.DictReader(table))
     options = PackOptions(quality=85, vertical="unknown")
     store = MapStore(build_pack(written / "town_dop.tif", written / "town_dsm.tif", tmp_path / "pack", options))
     assert store.dop_grids[0].gsd_m == pytest.approx(0.2)
