@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from ortholoc_edge.errors import MapError
@@ -133,7 +134,8 @@ class LoadedLayer:
 
         def paste(cog: Cog, piece: PixelWindow, place: tuple[slice, slice]) -> None:
             bands, mask = cog.read_image(level, piece)
-            rgb[place] = np.moveaxis(bands, 0, -1)
+            # Several times as fast as moving the axis.
+            rgb[place] = cv2.merge(list(bands))
             valid[place] = mask
 
         self._assemble(level, window, paste)

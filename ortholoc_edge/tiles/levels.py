@@ -24,7 +24,7 @@ STORED_LEVELS = (0, 2, 4)
 # with the heights around it.
 _MIN_VALID_SHARE = 0.75
 
-_SMOOTHING_PX = 9
+_SMOOTHING_PX = 5
 
 
 def next_stored(stored: Sequence[int], level: int) -> int:
@@ -64,16 +64,27 @@ def halved_heights(heights: Float32Array, share: Float32Array | None = None) -> 
         else NaN; and the shares of these cells.
     """
     if share is None:
-        if np.isfinite(heights).all():
-            mean = (_four(heights.astype(np.float64)) / 4).astype(np.float32)
-            return mean, np.ones_like(mean)
-        share = np.isfinite(heights).astype(np.float32)
+        return _halved_plain(heights)
     weighted = np.where(np.isnan(heights), 0.0, heights).astype(np.float64) * share
     sums, weights = _four(weighted), _four(share)
     found = np.divide(sums, weights, out=np.full_like(sums, np.nan), where=weights / 4 >= _MIN_VALID_SHARE)
     # A cell that was refused gives nothing to the next level.
     carried = np.where(np.isnan(found), 0.0, weights / 4)
     return found.astype(np.float32), carried.astype(np.float32)
+
+
+def _halved_plain(heights: Float32Array) -> tuple[Float32Array, Float32Array]:
+    """`halved_heights` of cells that had all of their data: what is done in flight."""
+    size = heights.shape[0] // 2, heights.shape[1] // 2
+    sums, count = np.zeros(size), np.zeros(size, dtype=np.uint8)
+    for one in (heights[0::2, 0::2], heights[0::2, 1::2], heights[1::2, 0::2], heights[1::2, 1::2]):
+        known = ~np.isnan(one)
+        count += known
+        np.add(sums, one, out=sums, where=known)
+    enough = count >= 4 * _MIN_VALID_SHARE
+    mean = np.full(size, np.nan, dtype=np.float32)
+    np.divide(sums, count, out=mean, where=enough, casting="same_kind")
+    return mean, np.where(enough, count / np.float32(4), np.float32(0)).astype(np.float32)
 
 
 def filled(rgb: ImageArray, valid: BoolArray) -> ImageArray:
@@ -91,7 +102,7 @@ def filled(rgb: ImageArray, valid: BoolArray) -> ImageArray:
     smooth = cv2.resize(filled(*halved_image(rgb, valid)), (columns, rows), interpolation=cv2.INTER_LINEAR_EXACT)
     own = valid.astype(np.uint8)
     smooth = cv2.copyTo(rgb, own, smooth)
-    # Without it 0.6 % more bytes on ragged maps. Of uint8 OpenCV's is in fixed-point numbers, too.
+    # Without it 0.3 to 0.6 % more bytes on ragged maps. Of uint8 OpenCV's is in fixed-point numbers, too.
     smooth = cv2.GaussianBlur(smooth, (_SMOOTHING_PX, _SMOOTHING_PX), 0)
     return np.asarray(cv2.copyTo(rgb, own, smooth), dtype=np.uint8)
 
