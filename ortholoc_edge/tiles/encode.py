@@ -103,11 +103,13 @@ def _cog(
     try:
         for level, (bands, valid) in enumerate(levels):
             files.append(MemoryFile())
-            place = _profile(grid.resized(bands.shape[2], bands.shape[1]), crs if level == 0 else None)
+            # Of the finest the grid itself: the division and back may cost its last digit.
+            place = grid if level == 0 else grid.resized(bands.shape[2], bands.shape[1])
+            profile = profile | _profile(place, crs if level == 0 else None)
             with (
                 quiet_georeference(),
                 rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True),
-                files[-1].open(**place, **profile) as target,
+                files[-1].open(**profile) as target,
             ):
                 target.write(bands)
                 if valid is not None:

@@ -93,7 +93,7 @@ def pack(tmp_path):
 def test_facts_as_json(pack, capsys):
     assert run("info", pack, "--json") == 0
     facts = json.loads(capsys.readouterr().out)
-    assert facts["format"] == 2
+    assert facts["format"] == 3
     assert facts["crs"] == "EPSG:32633"
     assert facts["extent_m"] == {"west": 400_000.0, "south": 5_298_976.0, "east": 401_024.0, "north": 5_300_000.0}
     assert facts["extent_deg"]["west"] < facts["centre"]["longitude_deg"] < facts["extent_deg"]["east"]
@@ -124,7 +124,7 @@ def test_facts_as_a_table(pack, capsys):
     assert run("info", pack) == 0
     table = capsys.readouterr().out
     for text in (
-        "format 2", "not dated", "EPSG:32633", "0.7864 km2", "DHHN2016 height",
+        "format 3", "not dated", "EPSG:32633", "0.7864 km2", "DHHN2016 height",
         "by tile -0.50 to -0.25 m", "1 sigma 0.1 m",
         "4 m/px, 5 levels to 64 m/px", "4 of up to 128 px, 512 m", "75.0 % of the tiles", "© Survey", "dl-de/by-2-0",
         "2019 to 2024-05-01", "new.tif, old.tif, a.tif and 1 more", "300.00 to 417.25 m", "50 of 100 on average",
