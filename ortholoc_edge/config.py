@@ -92,12 +92,14 @@ class MapOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class MatcherOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Which matcher. ``model``: a file instead of the built one; ``model_sha256``: what it must hash to.
+    """Which matcher: "structural" needs no model; "structural+xfeat" takes XFeat for frames that it can't place.
 
-    ``working_px``: long side at which frames are matched: time grows with its square. A multiple of 32 for xfeat.
+    The others are for matchers of features. ``model``: a file instead of the built one; ``model_sha256``: what it must
+    hash to. ``working_px``: long side at which frames are matched: time grows with its square. A multiple of 32 for
+    xfeat.
     """
 
-    name: str = "xfeat"
+    name: str = "structural"
     working_px: Annotated[int, Meta(ge=128, le=4096)] = 640
     max_keypoints: Annotated[int, Meta(ge=64, le=16384)] = 4096
     threads: Annotated[int, Meta(ge=1, le=64)] = 1
@@ -105,7 +107,7 @@ class MatcherOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     model_sha256: str | None = None
 
     def __post_init__(self) -> None:
-        if self.name == "xfeat" and self.working_px % _XFEAT_MULTIPLE_PX:
+        if self.name.removeprefix("structural+") == "xfeat" and self.working_px % _XFEAT_MULTIPLE_PX:
             below = self.working_px - self.working_px % _XFEAT_MULTIPLE_PX
             raise ValueError(
                 f"working_px = {self.working_px} is no multiple of {_XFEAT_MULTIPLE_PX}, as the matcher xfeat needs; "

@@ -18,8 +18,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Generic, TypeVar
 
-import numpy as np
-
 from ortholoc_edge.adapters import systemd
 from ortholoc_edge.adapters.bus import Bus
 from ortholoc_edge.adapters.camera import BadFrameError, EndOfFrames, FrameSource, open_source
@@ -46,8 +44,8 @@ from ortholoc_edge.geometry import covariance as cov
 from ortholoc_edge.geometry import frames
 from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.rigid import Rigid3
-from ortholoc_edge.matching.registry import make_matcher
-from ortholoc_edge.matching.types import Matcher
+from ortholoc_edge.matching.registry import make_method
+from ortholoc_edge.matching.types import AnyMatcher
 from ortholoc_edge.pipeline.frame import Frame, VehicleState
 from ortholoc_edge.pipeline.localizer import Localizer
 from ortholoc_edge.pipeline.navigator import Navigator
@@ -118,7 +116,7 @@ class Daemon:
         config: Config,
         *,
         frames: FrameSource | None = None,
-        matcher: Matcher | None = None,
+        matcher: AnyMatcher | None = None,
         clock: Clock | None = None,
         on_outcome: OutcomeListener | None = None,
     ) -> None:
@@ -146,7 +144,7 @@ class Daemon:
             self._georeference = self._store.pack.georeference
             _require_flyable(self._georeference, config.map.pack)
             options = config.matcher
-            self._matcher = matcher or make_matcher(
+            self._matcher = matcher or make_method(
                 options.name,
                 working_px=options.working_px,
                 max_keypoints=options.max_keypoints,
@@ -283,10 +281,7 @@ class Daemon:
 
     def _warm_up(self) -> None:
         """The first inference allocates and compiles; it must not happen in flight."""
-        camera = self._config.intrinsics.camera()
-        # Noise, because of an even picture no matcher asks its network.
-        picture = np.random.default_rng(0).integers(0, 256, (camera.height, camera.width), dtype=np.uint8)
-        self._matcher.extract(picture)
+        self._navigator.localizer.warm_up()
 
     # -- one frame -------------------------------------------------------------------------------------
 

@@ -16,7 +16,7 @@ from ortholoc_edge.bench.replay import FrameResult, PriorKind, PriorNoise, repla
 from ortholoc_edge.errors import DatasetError, MapError
 from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.camera import Camera
-from ortholoc_edge.matching.types import Matcher
+from ortholoc_edge.matching.types import AnyMatcher
 from ortholoc_edge.pipeline.localizer import Localizer, LocalizerOptions
 from ortholoc_edge.pose import pnp
 from ortholoc_edge.tiles.build import PackOptions, build_pack
@@ -34,7 +34,7 @@ def prior_used(kind: PriorKind, samples: bool) -> PriorKind:
 def run_flight(
     recorded: list[sequence.RecordedFrame],
     store: MapStore,
-    matcher: Matcher,
+    matcher: AnyMatcher,
     options: LocalizerOptions,
     kind: PriorKind,
     noise: PriorNoise,
@@ -65,7 +65,7 @@ def run_flight(
 
 def run_samples(
     paths: list[Path],
-    matcher: Matcher,
+    matcher: AnyMatcher,
     options: LocalizerOptions,
     kind: PriorKind,
     noise: PriorNoise,
@@ -144,7 +144,7 @@ def summarise(
     *,
     name: str,
     pack: str,
-    matcher: Matcher,
+    matcher: AnyMatcher,
     prior: PriorKind,
     adhop: bool,
     seed: int,

@@ -20,8 +20,8 @@ from ortholoc_edge.bench.runner import SAMPLES_PACK, prior_used, run_flight, run
 from ortholoc_edge.cli.arguments import positive_int
 from ortholoc_edge.cli.progress import ProgressBar
 from ortholoc_edge.errors import DatasetError, OrtholocError
-from ortholoc_edge.matching.registry import MATCHERS, make_matcher
-from ortholoc_edge.matching.types import Matcher
+from ortholoc_edge.matching.registry import METHODS, make_method
+from ortholoc_edge.matching.types import AnyMatcher
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
 from ortholoc_edge.tiles.build import PackOptions, build_pack
 from ortholoc_edge.tiles.store import MapStore
@@ -55,7 +55,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "is reported on stderr, the next ones go on, and the exit code is 1.",
     )
     parser.add_argument("data", type=Path, metavar="DATA")
-    parser.add_argument("--matchers", nargs="+", choices=MATCHERS, default=list(MATCHERS), help="default: all")
+    parser.add_argument(
+        "--matchers", nargs="+", choices=METHODS, default=["structural", "xfeat", "sift"],
+        help="default: %(default)s",
+    )  # fmt: skip
     parser.add_argument(
         "--priors", nargs="+", choices=[str(k) for k in PriorKind], default=["odometer", "none"],
         help="default: %(default)s",
@@ -106,14 +109,14 @@ def _sets(data: Path) -> list[_Set]:
     return list(found.values())
 
 
-def _matcher(name: str, args: argparse.Namespace) -> Matcher:
+def _matcher(name: str, args: argparse.Namespace) -> AnyMatcher:
     with ProgressBar(f"model {name}") as bar:
-        return make_matcher(
+        return make_method(
             name, working_px=args.working_px, max_keypoints=args.max_keypoints, threads=1, progress=bar.step
         )
 
 
-def _measure(one: _Set, matchers: Mapping[str, Matcher], scratch: Path, args: argparse.Namespace) -> None:
+def _measure(one: _Set, matchers: Mapping[str, AnyMatcher], scratch: Path, args: argparse.Namespace) -> None:
     store = _store(one, scratch)
     try:
         for summary in _rows(one, store, matchers, args):
@@ -130,7 +133,7 @@ def _store(one: _Set, scratch: Path) -> MapStore | None:
 
 
 def _rows(
-    one: _Set, store: MapStore | None, matchers: Mapping[str, Matcher], args: argparse.Namespace
+    one: _Set, store: MapStore | None, matchers: Mapping[str, AnyMatcher], args: argparse.Namespace
 ) -> Iterator[metrics.Summary]:
     # Samples know fewer priors than can be asked for: none is measured twice.
     priors = dict.fromkeys(prior_used(PriorKind(asked), samples=store is None) for asked in args.priors)
@@ -152,7 +155,7 @@ def _rows(
 
 
 def _frames(
-    one: _Set, store: MapStore | None, matcher: Matcher, options: LocalizerOptions, kind: PriorKind, seed: int
+    one: _Set, store: MapStore | None, matcher: AnyMatcher, options: LocalizerOptions, kind: PriorKind, seed: int
 ) -> Iterator[FrameResult]:
     noise = PriorNoise()
     if store is None:

@@ -8,18 +8,25 @@ from pathlib import Path
 from ortholoc_edge.cli.arguments import positive_int
 from ortholoc_edge.cli.progress import ProgressBar
 from ortholoc_edge.config import MatcherOptions
-from ortholoc_edge.matching.registry import MATCHERS, make_matcher
-from ortholoc_edge.matching.types import Matcher
+from ortholoc_edge.matching.registry import METHODS, make_method
+from ortholoc_edge.matching.types import AnyMatcher
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("matching")
-    group.add_argument("--matcher", choices=MATCHERS, default="xfeat", help="default: %(default)s")
+    group.add_argument(
+        "--matcher",
+        choices=METHODS,
+        default="structural",
+        metavar="NAME",
+        help=f"{', '.join(METHODS)}. Structural matching needs no model and a predicted pose; with +NAME that matcher "
+        "takes the frames that it can't place (default: %(default)s)",
+    )
     group.add_argument(
         "--working-px",
         type=positive_int,
         default=640,
-        help="long side at which images are matched, px; a multiple of 32 for all but sift (default: %(default)s)",
+        help="long side at which a matcher of features sees images, px; a multiple of 32 for all but sift (default: %(default)s)",
     )
     group.add_argument(
         "--max-keypoints",
@@ -58,10 +65,10 @@ def settings(args: argparse.Namespace) -> MatcherOptions:
     )
 
 
-def matcher(args: argparse.Namespace) -> Matcher:
+def matcher(args: argparse.Namespace) -> AnyMatcher:
     """The matcher that the arguments name; its model is built first where that was never done."""
     with ProgressBar(f"model {args.matcher}") as bar:
-        return make_matcher(
+        return make_method(
             args.matcher,
             working_px=args.working_px,
             max_keypoints=args.max_keypoints,

@@ -8,12 +8,45 @@ from typing import Final
 from ortholoc_edge.errors import ConfigError
 from ortholoc_edge.matching import models
 from ortholoc_edge.matching.sift import SiftMatcher
-from ortholoc_edge.matching.types import Matcher
+from ortholoc_edge.matching.types import STRUCTURAL, AnyMatcher, Matcher, Structural
 
 MATCHERS: Final = ("xfeat", "xfeat-star", "xfeat-lighterglue", "sift")
+# Ways to match a frame with the map: those, structural matching, and structural matching with one of those for frames
+# that it can't place.
+METHODS: Final = (STRUCTURAL, *(f"{STRUCTURAL}+{name}" for name in MATCHERS), *MATCHERS)
 
 # Matchers that run two graphs.
 _PAIRED: Final = ("xfeat-star", "xfeat-lighterglue")
+
+
+def make_method(
+    name: str,
+    *,
+    working_px: int,
+    max_keypoints: int,
+    threads: int,
+    model_path: Path | None = None,
+    model_sha256: str | None = None,
+    progress: models.Progress | None = None,
+) -> AnyMatcher:
+    """One of ``METHODS``; arguments and errors are those of `make_matcher`, for its matcher of features."""
+    if name not in METHODS:
+        raise ConfigError(f"matcher {name!r} is not known; known are: {', '.join(METHODS)}")
+    if name == STRUCTURAL:
+        if model_path is not None or model_sha256 is not None:
+            raise ConfigError(f"matcher {name!r} uses no model; leave it away")
+        return Structural()
+    structural = name.startswith(f"{STRUCTURAL}+")
+    matcher = make_matcher(
+        name.removeprefix(f"{STRUCTURAL}+"),
+        working_px=working_px,
+        max_keypoints=max_keypoints,
+        threads=threads,
+        model_path=model_path,
+        model_sha256=model_sha256,
+        progress=progress,
+    )
+    return Structural(matcher) if structural else matcher
 
 
 def make_matcher(

@@ -98,3 +98,27 @@ class UnscaledMatcher(Matcher, Protocol):
     def extract_unscaled(self, image: ImageArray, valid: BoolArray | None = None) -> Features:
         """As `extract`, with nothing resized."""
         ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Structural:
+    """Not local features, but the edges of the whole picture against the map drawn in the predicted view; needs no
+    weights, and a predicted pose (`pipeline.structural`).
+
+    Attributes:
+        acquire: for frames that it can't place; None: those give no fix.
+    """
+
+    acquire: Matcher | None = None
+
+    @property
+    def name(self) -> str:
+        return STRUCTURAL if self.acquire is None else f"{STRUCTURAL}+{self.acquire.name}"
+
+    @property
+    def model_sha256(self) -> str | None:
+        return None if self.acquire is None else self.acquire.model_sha256
+
+
+STRUCTURAL = "structural"
+AnyMatcher = Matcher | Structural

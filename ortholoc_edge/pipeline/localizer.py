@@ -19,8 +19,8 @@ from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.grid import resize_px
 from ortholoc_edge.matching.adhop import fit_homography
-from ortholoc_edge.matching.types import Features, Matcher, Matches, UnscaledMatcher
-from ortholoc_edge.pipeline import gate, precondition
+from ortholoc_edge.matching.types import AnyMatcher, Features, Matcher, Matches, Structural, UnscaledMatcher
+from ortholoc_edge.pipeline import gate, precondition, structural
 from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.precondition import ReferenceView
@@ -33,7 +33,8 @@ from ortholoc_edge.pipeline.prior import (
     hypotheses,
     search_bounds,
 )
-from ortholoc_edge.pipeline.rounds import RejectedError, Round, Scene
+from ortholoc_edge.pipeline.render import Terrain
+from ortholoc_edge.pipeline.rounds import RejectedError, Round, Scene, Solved
 from ortholoc_edge.pipeline.stored import Attempt, StoredMatching
 from ortholoc_edge.pipeline.trace import Trace
 from ortholoc_edge.pose import calibrate, pnp
@@ -100,13 +101,15 @@ class _MapScene:
 class Localizer:
     """Camera, map and matcher, put to work on one frame at a time by one thread."""
 
-    def __init__(self, camera: Camera, store: MapStore, matcher: Matcher, options: LocalizerOptions) -> None:
+    def __init__(self, camera: Camera, store: MapStore, matcher: AnyMatcher, options: LocalizerOptions) -> None:
         self.camera = camera
-        self.matcher = matcher
+        self._acquire = matcher.acquire if isinstance(matcher, Structural) else matcher
+        self._tracking = structural.QueryMaker(camera) if isinstance(matcher, Structural) else None
         self._store = store
         self._options = options
         self._max_error_px = pnp.threshold_px(camera)
-        scale = min(1.0, matcher.working_px / max(camera.width, camera.height))
+        working_px = structural.TUNING.levels[-1].long_px if self._acquire is None else self._acquire.working_px
+        scale = min(1.0, working_px / max(camera.width, camera.height))
         # The size at which the matcher sees the frame; views of the map are drawn at the same size.
         self._working = camera.pinhole().resized(
             max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
@@ -124,6 +127,10 @@ class Localizer:
         wanted = self._options.precomputed_features
         if wanted == "never" or (wanted == "auto" and self._store.pack.manifest.features is None):
             return None
+        if self._acquire is None:
+            if wanted == "require":
+                raise MapError("structural matching has no use for stored features; name a matcher of features, too")
+            return None
         try:
             index = FeatureIndex(self._store, self.matcher)
         except MapError as error:
@@ -136,6 +143,24 @@ class Localizer:
 
     def close(self) -> None:
         self._worker.shutdown()
+
+    def warm_up(self) -> None:
+        """Extract from a picture, so that what is allocated and compiled at first use is ready.
+
+        Raises: ModelError if the matcher itself fails.
+        """
+        # Noise, because of an even picture no matcher asks its network.
+        picture = np.random.default_rng(0).integers(0, 256, (self.camera.height, self.camera.width), dtype=np.uint8)
+        if self._tracking is not None:
+            self._tracking.fields(picture)
+        if self._acquire is not None:
+            self._acquire.extract(picture)
+
+    @property
+    def matcher(self) -> Matcher:
+        """Of features; structural matching alone never asks for it."""
+        assert self._acquire is not None, "a localizer without a matcher of features needs none"
+        return self._acquire
 
     def localize(
         self, frame: Frame, prior: PosePrior | RegionPrior, proceed: Callable[[], bool] = lambda: True
@@ -156,14 +181,66 @@ class Localizer:
 
     def _localize(self, frame: Frame, prior: PosePrior | RegionPrior, proceed: Callable[[], bool], trace: Trace) -> Fix:
         grey = self._checked_grey(frame)
+        only_stored = self._options.precomputed_features == "require"
+        if self._tracking is not None and not only_stored:
+            if not isinstance(prior, PosePrior):
+                refused = RejectedError(Reason.NO_PRIOR, "structural matching needs a predicted pose")
+            else:
+                try:
+                    return self._by_structure(self._tracking, frame, grey, prior, trace)
+                except RejectedError as error:
+                    refused = error
+            if self._acquire is None or not proceed():
+                raise refused
         if self._stored is not None and isinstance(prior, PosePrior):
             try:
                 return self._by_stored_features(self._stored, frame, grey, prior, proceed, trace)
             except RejectedError as error:
-                if self._options.precomputed_features == "require" or error.reason is Reason.LATE or not proceed():
+                if only_stored or error.reason is Reason.LATE or not proceed():
                     raise
-        elif self._options.precomputed_features == "require":
+        elif only_stored:
             raise RejectedError(Reason.NO_PRIOR, "stored features need a predicted pose")
+        return self._by_network(frame, grey, prior, proceed, trace)
+
+    def _by_structure(
+        self, tracking: structural.QueryMaker, frame: Frame, grey: ImageArray, prior: PosePrior, trace: Trace
+    ) -> Fix:
+        """The fix without local features."""
+        query = self._worker.submit(self._query_fields, tracking, grey, trace)
+        try:
+            with trace.stage("map_window"):
+                ground_m, outline = self._predicted_ground(prior)
+                gsd_m = self._distance_to_ground(prior, ground_m) / self._working.focal_px
+                window = self._read(search_bounds(outline, prior, ground_m, self._options.search_sigmas), gsd_m)
+                local = self._local_frame(window, ground_m)
+                terrain = Terrain.of(window, precondition.grey_map(window), local)
+            if terrain is None:
+                raise RejectedError(Reason.MAP_NODATA, "the surface model has no data under the predicted view")
+            found = structural.Tracking(query.result(), terrain, prior, self.camera, trace).run()
+        finally:
+            query.cancel()
+        if found is None:
+            raise RejectedError(Reason.FEW_MATCHES, "the map in the predicted view looks nothing like the frame")
+        with trace.stage("gate"):
+            solved = Solved(
+                found.query_px, local.map_from_local(found.points_local), found.estimate, len(found.query_px)
+            )
+            fix = self._fix(frame, solved, Scene(window, local, ground_m), prior)
+        return replace(fix, timings_ms=trace.timings_ms())
+
+    def _query_fields(self, tracking: structural.QueryMaker, grey: ImageArray, trace: Trace) -> structural.QueryFields:
+        with trace.stage("query_features"):
+            return tracking.fields(grey)
+
+    def _by_network(
+        self,
+        frame: Frame,
+        grey: ImageArray,
+        prior: PosePrior | RegionPrior,
+        proceed: Callable[[], bool],
+        trace: Trace,
+    ) -> Fix:
+        """The fix from local features of frame and map."""
         query = self._worker.submit(self._query_features, grey, trace)
         try:
             scene, first = self._first_round(query, prior, proceed, trace)
@@ -174,7 +251,7 @@ class Localizer:
         finally:
             query.cancel()
         with trace.stage("gate"):
-            fix = self._fix(frame, second or first, scene.scene, prior)
+            fix = self._fix(frame, (second or first).solved, scene.scene, prior)
         return replace(
             fix,
             adhop_accepted=second is not None if self._options.adhop else None,
@@ -213,13 +290,13 @@ class Localizer:
         again = before = None
         if self._options.adhop:
             try:
-                before = self._fix(frame, first.found, first.scene, prior, _BEFORE_LOOKING_AGAIN)
+                before = self._fix(frame, first.found.solved, first.scene, prior, _BEFORE_LOOKING_AGAIN)
             except RejectedError:
                 first = stored.rectified_again(grey, first, self._homography_threshold_px, trace)
-                before = self._fix(frame, first.found, first.scene, prior, _BEFORE_LOOKING_AGAIN)
+                before = self._fix(frame, first.found.solved, first.scene, prior, _BEFORE_LOOKING_AGAIN)
             again = stored.looked_again(first, trace)
         with trace.stage("gate"):
-            fix = self._fix(frame, again or first.found, first.scene, prior)
+            fix = self._fix(frame, (again or first.found).solved, first.scene, prior)
             limits = self._options.gate
             if before is not None and (before.inliers < limits.min_inliers or before.quality < limits.min_inlier_ratio):
                 needed = _AFTER_LOOKING_AGAIN * limits.min_inliers
@@ -507,18 +584,18 @@ class Localizer:
     # -- judgement -------------------------------------------------------------------------------------
 
     def _fix(
-        self, frame: Frame, chosen: Round, scene: Scene, prior: PosePrior | RegionPrior, inliers_needed: float = 1.0
+        self, frame: Frame, chosen: Solved, scene: Scene, prior: PosePrior | RegionPrior, inliers_needed: float = 1.0
     ) -> Fix:
         """
         Args:
             inliers_needed: part of the gate's least number and ratio of inliers that is enough.
         """
         estimate = chosen.estimate
-        if len(chosen.kept) < _MIN_MATCHES:
+        if len(chosen.query_px) < _MIN_MATCHES:
             raise RejectedError(
                 Reason.FEW_MATCHES,
-                f"{len(chosen.matches)} matches, of which with a height",
-                len(chosen.kept),
+                f"{chosen.matches} matches, of which with a height",
+                len(chosen.query_px),
                 _MIN_MATCHES,
             )
         if estimate is None:
@@ -536,11 +613,10 @@ class Localizer:
         covariance = estimate.covariance + self._map_covariance
         below = float(self._store.heights(pose.translation[None, :2])[0])
         height_m = float(pose.translation[2]) - (below if math.isfinite(below) else scene.ground_m)
-        query_px = chosen.matches.query_px[chosen.kept]
         limits = self._options.gate
         refusal = gate.check(
             estimate,
-            query_px,
+            chosen.query_px,
             pose,
             covariance,
             height_m,
@@ -562,11 +638,11 @@ class Localizer:
             focal_sigma_px=estimate.focal_sigma_px,
             covariance=covariance,
             quality=float(inliers.mean()),
-            matches=len(chosen.matches),
+            matches=chosen.matches,
             inliers=int(np.count_nonzero(inliers)),
             rms_px=estimate.rms_px,
             adhop_accepted=None,
-            query_px=query_px[inliers],
+            query_px=chosen.query_px[inliers],
             points_map=chosen.points_map[inliers],
         )
 

@@ -28,6 +28,22 @@ class RejectedError(Exception):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Solved:
+    """Matches with a height, and the pose that they gave.
+
+    Attributes:
+        query_px: (M, 2) frame pixels without distortion; points_map: (M, 3).
+        estimate: over these M, in the local frame; None: they determine none.
+        matches: how many there were, with or without a height.
+    """
+
+    query_px: FloatArray
+    points_map: FloatArray
+    estimate: pnp.PoseEstimate | None
+    matches: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Round:
     """One matching round.
 
@@ -44,6 +60,10 @@ class Round:
     points_map: FloatArray
     estimate: pnp.PoseEstimate | None
     mean_error_px: float
+
+    @property
+    def solved(self) -> Solved:
+        return Solved(self.matches.query_px[self.kept], self.points_map, self.estimate, len(self.matches))
 
     @property
     def inliers(self) -> int:

@@ -1,0 +1,257 @@
+"""The map as a camera would see it: the orthophoto drawn in perspective over the surface model, with occlusion.
+
+A plane homography shows flat ground; this shows relief, and knows for every pixel which point of the map it is. Rays
+are marched down through the surface on a coarse net of pixels and end at the first thing they meet; between the net's
+nodes the fall is interpolated. What the map does not have stays unseen: walls (a surface model is 2.5D), and what hides
+behind an edge by less than a cell.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+
+from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, ImageArray
+from ortholoc_edge.geometry.camera import Camera
+from ortholoc_edge.geometry.grid import RasterGrid
+from ortholoc_edge.geometry.rigid import Rigid3
+from ortholoc_edge.pipeline.prior import MAX_RANGE_HEIGHTS
+from ortholoc_edge.tiles.georeference import LocalFrame
+from ortholoc_edge.tiles.window import MapWindow
+
+# Pixels between the nodes of the net that rays are marched on.
+_NODE_PX = 4
+# A ray may pass this many cells of the surface model from one look at it to the next, and looks so often at most.
+_CELLS_PER_STEP = 2.0
+_MIN_STEPS, _MAX_STEPS = 3, 32
+# Looks at the surface once more where the ray met it, so that even slopes are exact.
+_POLISHES = 2
+# Picture of the map that is drawn from: the coarsest that has no larger pixels than the view, times this.
+_LEVEL_SLACK = 1.42
+_MIN_PICTURE_PX = 48
+# Rays that start in a crown or below a hilltop start at this part of the height above the lowest ground.
+_CLEARANCE = 0.05
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Picture:
+    """The window's orthophoto in grey, at one pixel size. ``valid`` (H, W) 0 or 255; None: everywhere."""
+
+    grey: ImageArray
+    valid: ImageArray | None
+    grid: RasterGrid
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Terrain:
+    """A window of the map made ready for drawing.
+
+    Attributes:
+        local: metric frame that poses are given in.
+        heights: (h, w) float32 on ``grid``, m; holes at the lowest height.
+        known: (h, w) float32, 1 where the surface model has data, else 0; None: it has everywhere.
+        lowest_m, highest_m: of the heights.
+        pictures: of the orthophoto, each half as fine as the one before.
+    """
+
+    local: LocalFrame
+    grid: RasterGrid
+    heights: Float32Array
+    known: Float32Array | None
+    lowest_m: float
+    highest_m: float
+    pictures: tuple[_Picture, ...]
+
+    @staticmethod
+    def of(window: MapWindow, dop_grey: ImageArray, local: LocalFrame) -> Terrain | None:
+        """None where the surface model has no data."""
+        # NaN spoils a sum but no minimum that leaves it out: one pass where there is none.
+        known = None if math.isfinite(float(window.dsm.sum())) else np.isfinite(window.dsm)
+        heights = window.dsm
+        if known is not None:
+            if not known.any():
+                return None
+            heights = np.where(known, heights, np.float32(heights[known].min()))
+        return Terrain(
+            local,
+            window.dsm_grid,
+            heights,
+            None if known is None else known.astype(np.float32),
+            float(heights.min()),
+            float(heights.max()),
+            _pyramid(dop_grey, window.dop_valid, window.dop_grid),
+        )
+
+
+def _pyramid(grey: ImageArray, valid: BoolArray, grid: RasterGrid) -> tuple[_Picture, ...]:
+    mask = None if valid.all() else valid.astype(np.uint8) * np.uint8(255)
+    pictures = [_Picture(grey, mask, grid)]
+    while min(pictures[-1].grey.shape) >= 2 * _MIN_PICTURE_PX:
+        finer = pictures[-1]
+        size = finer.grid.width // 2, finer.grid.height // 2
+        pictures.append(
+            _Picture(
+                _averaged(finer.grey, size),
+                None if finer.valid is None else _averaged(finer.valid, size),
+                finer.grid.resized(*size),
+            )
+        )
+    return tuple(pictures)
+
+
+def _averaged(image: ImageArray, size: tuple[int, int]) -> ImageArray:
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderedView:
+    """What a camera should see from a pose.
+
+    Attributes:
+        image: (H, W) uint8 grey; 0 where it shows no map.
+        valid: (H, W) bool.
+        camera, local_from_camera: that it is drawn for.
+        fall_m: (h, w) float32, from the camera's height down to what the nodes' rays meet.
+        steep: (h, w) bool, nodes beside which the surface jumps: a wall or an edge, where the map's point is doubtful.
+    """
+
+    image: ImageArray
+    valid: BoolArray
+    camera: Camera
+    local_from_camera: Rigid3
+    fall_m: Float32Array
+    steep: BoolArray
+
+    def points_local(self, px: FloatArray) -> FloatArray:
+        """Points (N, 3) of the map, local m, that pixels (N, 2) of the view show. They lie on the pixels' rays."""
+        if not len(px):
+            return np.empty((0, 3))
+        rays = self.camera.unproject(px) @ self.local_from_camera.rotation.T
+        nodes = _node_px(px)
+        fall = cv2.remap(
+            self.fall_m, nodes[None, :, 0], nodes[None, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )[0].astype(np.float64)
+        return np.asarray(self.local_from_camera.translation + rays * (fall / -rays[:, 2])[:, None], dtype=np.float64)
+
+    def is_steep(self, px: FloatArray) -> BoolArray:
+        """Which pixels (N, 2) lie at a jump of the surface."""
+        column, row = np.round(_node_px(px)).astype(np.intp).T
+        return np.asarray(self.steep[row, column])
+
+
+def _node_px(px: FloatArray) -> Float32Array:
+    # The net begins one node outside, with centres as OpenCV's resizing has them.
+    return np.asarray((px - (0.5 * _NODE_PX - 0.5)) / _NODE_PX + 1.0, dtype=np.float32)
+
+
+def render(terrain: Terrain, camera: Camera, local_from_camera: Rigid3) -> RenderedView:
+    """Draw the map.
+
+    Args:
+        camera: its distortion is ignored.
+    Returns: a view that is invalid above the horizon, beyond `prior.MAX_RANGE_HEIGHTS` heights, off the window and
+        where orthophoto or surface have no data.
+    """
+    grid, local = terrain.grid, terrain.local
+    columns, rows = (-(-side // _NODE_PX) + 2 for side in (camera.width, camera.height))
+    first = 0.5 * _NODE_PX - 0.5 - _NODE_PX
+    u, v = np.meshgrid(first + _NODE_PX * np.arange(columns), first + _NODE_PX * np.arange(rows))
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
+    east, north, up = np.moveaxis(rays @ local_from_camera.rotation.T, -1, 0)
+    centre = local_from_camera.translation
+    ahead = -up * MAX_RANGE_HEIGHTS >= 1.0
+    # Cells of the surface model per metre of fall.
+    falling = np.where(ahead, -up, 1.0)
+    slope_x = (np.where(ahead, east, 0.0) / falling * (local.grid_scale / grid.dx)).astype(np.float32)
+    slope_y = (np.where(ahead, north, 0.0) / falling * (local.grid_scale / grid.dy)).astype(np.float32)
+    start = local.map_from_local(centre)
+    x0, y0 = (np.float32(value) for value in grid.px_from_map(start[:2]))
+    fall, steep = _first_hits(terrain, float(centre[2]), ahead, slope_x, slope_y, x0, y0)
+    x, y = x0 + slope_x * fall, y0 + slope_y * fall
+    seen = ahead & (x >= 0) & (x <= grid.width - 1) & (y >= 0) & (y <= grid.height - 1)
+    if terrain.known is not None:
+        # A surface beside a hole is half invented.
+        seen &= cv2.remap(terrain.known, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT) > 0.999
+    picture = _picture_for(terrain, float(np.median(fall)) / camera.focal_px)
+    # Half pixels: both grids count from the centres of their first cells.
+    to_x, to_y = grid.dx / picture.grid.dx, grid.dy / picture.grid.dy
+    at_x = x * np.float32(to_x) + np.float32((grid.west - picture.grid.west) / picture.grid.dx + 0.5 * to_x - 0.5)
+    at_y = y * np.float32(to_y) + np.float32((grid.top - picture.grid.top) / picture.grid.dy + 0.5 * to_y - 0.5)
+    full_x, full_y = _upsampled(at_x, camera), _upsampled(at_y, camera)
+    image = cv2.remap(picture.grey, full_x, full_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    seen &= (at_x >= 0) & (at_x <= picture.grid.width - 1) & (at_y >= 0) & (at_y <= picture.grid.height - 1)
+    if seen.all():
+        valid = np.ones((camera.height, camera.width), np.bool_)
+    else:
+        valid = _upsampled(seen.astype(np.float32), camera) > 0.999
+    if picture.valid is not None:
+        known = cv2.remap(picture.valid, full_x, full_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        valid &= np.asarray(known) >= 254
+    return RenderedView(np.asarray(image, dtype=np.uint8), valid, camera, local_from_camera, fall, steep)
+
+
+def _first_hits(
+    terrain: Terrain,
+    height_m: float,
+    ahead: BoolArray,
+    slope_x: Float32Array,
+    slope_y: Float32Array,
+    x0: np.float32,
+    y0: np.float32,
+) -> tuple[Float32Array, BoolArray]:
+    """Fall (h, w) at which the rays first meet the surface, and where the surface jumps there."""
+
+    def above(fall: Float32Array | np.float32) -> Float32Array:
+        """How far above the surface rays are that have fallen so far, m."""
+        heights = cv2.remap(
+            terrain.heights, x0 + slope_x * fall, y0 + slope_y * fall, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        return np.asarray(np.float32(height_m) - fall - heights, dtype=np.float32)
+
+    deepest = max(height_m - terrain.lowest_m, 1e-3)
+    highest = min(max(height_m - terrain.highest_m, _CLEARANCE * deepest), deepest)
+    run = np.hypot(slope_x, slope_y)
+    cells = (deepest - highest) * float(np.percentile(run[ahead], 90)) if ahead.any() else 0.0
+    steps = int(np.clip(math.ceil(cells / _CELLS_PER_STEP), _MIN_STEPS, _MAX_STEPS))
+    falls = np.linspace(highest, deepest, steps + 1).astype(np.float32)
+    fall = np.full(slope_x.shape, falls[-1], np.float32)
+    open_rays = ahead.copy()
+    before = above(falls[0])
+    for low, high in pairwise(falls):
+        after = above(high)
+        hits = open_rays & (after <= 0)
+        # Between two looks the ray and the surface are taken as straight.
+        part = np.clip(before / np.maximum(before - after, np.float32(1e-6)), 0, 1)
+        np.copyto(fall, low + (high - low) * part, where=hits)
+        open_rays &= ~hits
+        before = after
+        if not open_rays.any():
+            break
+    reach = np.float32((deepest - highest) / steps)
+    moved = np.zeros_like(fall)
+    for _ in range(_POLISHES):
+        moved = above(fall)
+        np.copyto(fall, fall + moved, where=np.abs(moved) < reach)
+    steep = np.abs(moved) > np.maximum(0.05 * reach, np.float32(0.25))
+    return fall, steep
+
+
+def _picture_for(terrain: Terrain, gsd_m: float) -> _Picture:
+    best = terrain.pictures[0]
+    for picture in terrain.pictures:
+        if picture.grid.gsd_m <= _LEVEL_SLACK * gsd_m * terrain.local.grid_scale:
+            best = picture
+    return best
+
+
+def _upsampled(nodes: Float32Array, camera: Camera) -> Float32Array:
+    """Values (H, W) at the pixels, of values at the nodes."""
+    size = nodes.shape[1] * _NODE_PX, nodes.shape[0] * _NODE_PX
+    full = cv2.resize(nodes, size, interpolation=cv2.INTER_LINEAR)
+    return np.ascontiguousarray(
+        full[_NODE_PX : _NODE_PX + camera.height, _NODE_PX : _NODE_PX + camera.width], dtype=np.float32
+    )

@@ -1,0 +1,423 @@
+"""Tracking without weights: the frame against the map drawn in the predicted view, coarse to fine.
+
+At each level the map is drawn over its surface model at the pose so far, the two pictures' edge directions are
+correlated patch by patch, and the pose is adjusted to what was found, with the prediction as one more measurement. So
+AdHoP's second look is taken in three dimensions, once per level. Where that does not convince, the view is searched for
+among turns, scales and shifts that the prior allows.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ortholoc_edge.geometry import covariance as cov
+from ortholoc_edge.geometry import rotation
+from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, ImageArray
+from ortholoc_edge.geometry.camera import Camera
+from ortholoc_edge.geometry.grid import resize_px
+from ortholoc_edge.geometry.rigid import Rigid3
+from ortholoc_edge.matching import structural
+from ortholoc_edge.matching.orientation import orientation_field
+from ortholoc_edge.pipeline.prior import MAX_RANGE_HEIGHTS, PosePrior
+from ortholoc_edge.pipeline.render import RenderedView, Terrain, render
+from ortholoc_edge.pipeline.trace import Trace
+from ortholoc_edge.pose.adjust import Adjusted, PoseMeasurement, adjust
+from ortholoc_edge.pose.pnp import PoseEstimate
+
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """Long side of the picture; radius, cell and cells per patch of `structural.correlate`."""
+
+    long_px: int
+    radius_px: int
+    cell_px: int
+    patch_cells: int
+
+
+@dataclass(frozen=True, slots=True)
+class Tuning:
+    """What docs/studies/structural.md settled, to be varied there.
+
+    ``render_again``: the map is drawn anew at each level, at the pose so far.
+    ``attitude``: the prior's attitude takes part in the pose that goes out.
+    ``match_covariance``: a patch counts by how sharp its peak is, and not as all others.
+    ``sigma_px``: standard deviation of a patch's place, px of the level, before that of its peak.
+    ``edge_weight``: of patches whose middle lies at a jump of the surface, where a 2.5D map is doubtful.
+    """
+
+    levels: tuple[Level, ...] = (Level(128, 6, 8, 6), Level(256, 3, 8, 6), Level(512, 2, 16, 3))
+    render_again: bool = True
+    attitude: bool = True
+    match_covariance: bool = True
+    sigma_px: float = 0.2
+    edge_weight: float = 1.0
+
+
+TUNING = Tuning()
+# Of a patch, below which its peak is chance.
+_MIN_SCORE = 0.2
+# Standard deviation of the whole picture's shift, px of the level.
+_WHOLE_SIGMA_PX = 2.0
+# Scales of the robust loss in px: wide first, where the whole picture may still be turned by some degrees.
+_FIRST_SCALES_PX = (6.0, 2.5, 1.2)
+_LATER_SCALES_PX = (2.5, 1.2, 0.9)
+# Part of a view that must show map.
+_MIN_VALID = 0.1
+_MIN_MATCHES = 5
+# Of matches that agree with the pose, px of the level. Chance spreads them over the radius.
+_INLIER_PX = 1.0
+_LAST_INLIER_PX = 0.8
+# Shift of the whole view that is looked for, in sigmas of the prior, and its limits as parts of the long side.
+_REACH_SIGMAS = 3.5
+_MIN_REACH, _MAX_REACH = 0.08, 0.45
+# Matches that agree at the last level, and their shares there and before, that leave other ways untried. Of 174 right
+# tracks on the real flights 1 % had fewer than 162 and 0.78; of 344 frames shown where they do not belong the best had
+# 17 (docs/studies/structural.md).
+_CONVINCING_MATCHES = 60
+_CONVINCING_RATIO = 0.67
+_CONVINCING_BEFORE = 0.5
+# A search turns the view by steps, within so many sigmas of the heading, and follows so many of the best peaks.
+_SEARCH_SIGMAS = 2.5
+_TURN_STEP_RAD = math.radians(7.0)
+_MAX_TURNS = 9
+_PEAKS_PER_TURN = 2
+_CANDIDATES = 4
+# Matches closer than a fifth of the long side share the errors of a patch of the map and of the camera's model.
+_CLUSTERS_ACROSS = 5
+# As in `pose.pnp`: errors that vary slowly are absorbed by the pose.
+_ABSORBED_ERROR_FACTOR = 2.5
+# Also where a prior claims to be exact there is something to divide by: 1 mm, 1e-5 rad.
+_EXACT = np.diag([1e-6] * 3 + [1e-10] * 3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class QueryFields:
+    """A frame as the levels see it: pinhole cameras and fields (2, h, w) by level."""
+
+    cameras: tuple[Camera, ...]
+    fields: tuple[Float32Array, ...]
+
+
+class QueryMaker:
+    """Brings frames of one camera to the levels."""
+
+    def __init__(self, camera: Camera, tuning: Tuning = TUNING) -> None:
+        pinhole = camera.pinhole()
+        self._cameras = tuple(pinhole.resized(*_size(camera, level.long_px)) for level in tuning.levels)
+        self._undistortion: tuple[np.ndarray, np.ndarray] | None = None
+        if not camera.is_pinhole:
+            last = self._cameras[-1]
+            u, v = np.meshgrid(np.arange(last.width), np.arange(last.height))
+            rays = last.unproject(np.stack([u, v], axis=-1))
+            distorted = camera.resized(last.width, last.height).project(rays).astype(np.float32)
+            self._undistortion = distorted[..., 0], distorted[..., 1]
+
+    def fields(self, grey: ImageArray) -> QueryFields:
+        """Of a frame (H, W)."""
+        last = self._cameras[-1]
+        image = np.asarray(cv2.resize(grey, (last.width, last.height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        if self._undistortion is not None:
+            image = np.asarray(
+                cv2.remap(image, *self._undistortion, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
+                dtype=np.uint8,
+            )
+        fields = [orientation_field(image)]
+        for camera in reversed(self._cameras[:-1]):
+            image = np.asarray(
+                cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA), dtype=np.uint8
+            )
+            fields.append(orientation_field(image))
+        return QueryFields(self._cameras, tuple(reversed(fields)))
+
+
+def _size(camera: Camera, long_px: int) -> tuple[int, int]:
+    scale = long_px / max(camera.width, camera.height)
+    return max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """What the levels came to.
+
+    Attributes:
+        estimate: at the frame's full size.
+        query_px: (M, 2) px of the frame without distortion; points_local: (M, 3).
+        looked_for: patches that could have been found.
+        convincing: whether other ways need not be tried.
+    """
+
+    estimate: PoseEstimate
+    query_px: FloatArray
+    points_local: FloatArray
+    looked_for: int
+    convincing: bool
+
+    @property
+    def inliers(self) -> int:
+        return int(np.count_nonzero(self.estimate.inliers))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Step:
+    """One level's outcome: matches (N) of level px and local points, and which agree with the pose."""
+
+    adjusted: Adjusted
+    px: FloatArray
+    points: FloatArray
+    inliers: BoolArray
+    looked_for: int
+
+    @property
+    def agreeing(self) -> float:
+        return float(self.inliers.mean()) if len(self.inliers) else 0.0
+
+
+class Tracking:
+    """A frame and where it is expected on a terrain.
+
+    Args:
+        camera: of the frame, at full size.
+        prior: in map coordinates; its covariance bounds the search.
+    """
+
+    def __init__(
+        self,
+        query: QueryFields,
+        terrain: Terrain,
+        prior: PosePrior,
+        camera: Camera,
+        trace: Trace,
+        tuning: Tuning = TUNING,
+    ) -> None:
+        self._query, self._terrain, self._prior, self._camera = query, terrain, prior, camera
+        self._trace, self._tuning = trace, tuning
+        predicted = terrain.local.local_from_map_pose(prior.map_from_camera)
+        covariance = prior.covariance + _EXACT
+        self._predicted = PoseMeasurement(predicted, np.asarray(np.linalg.inv(covariance), dtype=np.float64))
+        # The last word on the position has what was seen; the prediction only keeps the camera upright.
+        upright = np.zeros((6, 6))
+        if tuning.attitude:
+            upright[3:, 3:] = np.linalg.inv(covariance[3:, 3:])
+        self._upright = PoseMeasurement(predicted, upright)
+
+    def run(self) -> Track | None:
+        """The first track that convinces, else the one with the most inliers; None if there is none."""
+        best = self._descend(self._predicted.local_from_camera, first=0)
+        if best is not None and best.convincing:
+            return best
+        for start in self._search():
+            found = self._descend(start, first=1)
+            if found is not None and (best is None or found.inliers > best.inliers):
+                best = found
+            if best is not None and best.convincing:
+                break
+        return best
+
+    def _descend(self, pose: Rigid3, first: int) -> Track | None:
+        """Through the levels from ``first`` on; the whole view's shift is looked for at level 0 only."""
+        steps: list[_Step] = []
+        drawn_at = pose
+        last = len(self._tuning.levels) - 1
+        for number in range(first, last + 1):
+            known = self._upright if number == last else self._predicted
+            step = self._level(number, drawn_at, pose, known)
+            if step is None:
+                return None
+            steps.append(step)
+            pose = step.adjusted.local_from_camera
+            if self._tuning.render_again:
+                drawn_at = pose
+        return self._track(steps)
+
+    def _level(self, number: int, drawn_at: Rigid3, pose: Rigid3, known: PoseMeasurement) -> _Step | None:
+        """Matches of one level, and the pose adjusted to them.
+
+        Args:
+            drawn_at: pose that the map is drawn at; matches are looked for around where ``pose`` says.
+        """
+        level, camera, field = self._tuning.levels[number], self._query.cameras[number], self._query.fields[number]
+        with self._trace.stage("view"):
+            view = render(self._terrain, camera, drawn_at)
+        if view.valid.mean() < _MIN_VALID:
+            return None
+        with self._trace.stage("map_features"):
+            template = orientation_field(view.image, view.valid)
+        whole: tuple[int, int] | None = None
+        with self._trace.stage("match"):
+            if number == 0:
+                x, y, _ = structural.whole_shift(template, field, self._reach_px(view))[0]
+                whole = x, y
+            elif not self._tuning.render_again:
+                whole = self._middle_shift(view, template, pose)
+            found = structural.correlate(
+                template,
+                field,
+                radius=level.radius_px,
+                cell=level.cell_px,
+                patch_cells=level.patch_cells,
+                origin=whole or (0, 0),
+            )
+        with self._trace.stage("pose"):
+            return self._adjusted(number, view, found, template, known, pose, whole if number == 0 else None)
+
+    def _middle_shift(self, view: RenderedView, template: Float32Array, pose: Rigid3) -> tuple[int, int]:
+        middle = _middle_px(template)
+        seen = view.camera.project(pose.inverse().apply(view.points_local(middle)))
+        x, y = np.round(np.nan_to_num(seen - middle))[0]
+        return int(x), int(y)
+
+    def _reach_px(self, view: RenderedView) -> int:
+        """How far the whole view may be shifted by what the prior does not know, px."""
+        camera = view.camera
+        falling = max(-float(view.local_from_camera.rotation[2, 2]), 1.0 / MAX_RANGE_HEIGHTS)
+        distance_m = max(float(np.median(view.fall_m)) / falling, 1e-3)
+        sigma_px = camera.focal_px * math.hypot(
+            self._prior.position_sigma_m / distance_m, self._prior.tilt_sigma_rad
+        )
+        long_px = max(camera.width, camera.height)
+        return round(min(max(_REACH_SIGMAS * sigma_px, _MIN_REACH * long_px), _MAX_REACH * long_px))
+
+    def _adjusted(
+        self,
+        number: int,
+        view: RenderedView,
+        found: structural.Displacements,
+        template: Float32Array,
+        known: PoseMeasurement,
+        pose: Rigid3,
+        whole: tuple[int, int] | None,
+    ) -> _Step | None:
+        level = self._tuning.levels[number]
+        column, row = np.round(found.template_px).astype(np.intp).T
+        shown = view.valid[row, column]
+        found_well = found.take(np.flatnonzero(shown & (found.score >= _MIN_SCORE)))
+        px, seen_px = found_well.template_px, found_well.template_px + found_well.shift_px
+        # Patches overlap: so many share their pixels.
+        shared = level.patch_cells**2 / 4.0
+        information = self._information(view, found_well) / shared
+        if whole is not None:
+            middle = _middle_px(template)
+            px, seen_px = np.vstack([px, middle]), np.vstack([seen_px, middle + whole])
+            information = np.concatenate([information, np.eye(2)[None] / _WHOLE_SIGMA_PX**2])
+            pose = _moved_sideways(view, middle, np.asarray(whole, dtype=np.float64))
+        points = view.points_local(px)
+        scales = _FIRST_SCALES_PX if whole is not None else _LATER_SCALES_PX
+        adjusted = adjust(
+            points,
+            seen_px,
+            view.camera,
+            pose,
+            information=information,
+            measured=known,
+            scales=tuple(scale / (self._tuning.sigma_px * math.sqrt(shared)) for scale in scales),
+        )
+        if adjusted is None:
+            return None
+        # The whole view's shift was a help on the way, and is no match.
+        adjusted = adjusted.take(len(found_well))
+        limit = _LAST_INLIER_PX if number == len(self._tuning.levels) - 1 else _INLIER_PX
+        inliers = np.linalg.norm(adjusted.residuals_px, axis=1) <= limit
+        return _Step(
+            adjusted,
+            seen_px[: len(found_well)],
+            points[: len(found_well)],
+            np.asarray(inliers),
+            int(np.count_nonzero(shown)),
+        )
+
+    def _information(self, view: RenderedView, found: structural.Displacements) -> FloatArray:
+        """(N, 2, 2) of the patches' places, px^-2, as if they shared no pixel."""
+        covariance = np.broadcast_to(np.eye(2) * self._tuning.sigma_px**2, (len(found), 2, 2))
+        if self._tuning.match_covariance:
+            covariance = covariance + found.covariance
+        information = np.linalg.inv(covariance)
+        if self._tuning.edge_weight != 1.0:
+            at_edge = view.is_steep(found.template_px)
+            information = information * np.where(at_edge, self._tuning.edge_weight, 1.0)[:, None, None]
+        return np.asarray(information, dtype=np.float64)
+
+    def _track(self, steps: list[_Step]) -> Track | None:
+        last, camera = steps[-1], self._query.cameras[-1]
+        covariance = self._covariance(last, camera)
+        if covariance is None:
+            return None
+        scale = self._camera.width / camera.width, self._camera.height / camera.height
+        errors = np.nan_to_num(np.linalg.norm(last.adjusted.residuals_px * scale, axis=1), nan=np.inf)
+        count = int(np.count_nonzero(last.inliers))
+        estimate = PoseEstimate(
+            last.adjusted.local_from_camera,
+            self._camera,
+            covariance,
+            last.inliers,
+            errors,
+            float(np.sqrt(np.mean(errors[last.inliers] ** 2))),
+        )
+        convincing = (
+            count >= _CONVINCING_MATCHES
+            and last.agreeing >= _CONVINCING_RATIO
+            and all(step.agreeing >= _CONVINCING_BEFORE for step in steps)
+        )
+        return Track(estimate, resize_px(last.px, scale), last.points, last.looked_for, convincing)
+
+    def _covariance(self, step: _Step, camera: Camera) -> FloatArray | None:
+        """(6, 6): of what was seen, together with the attitude that was known; None if that determines no pose."""
+        inliers = step.inliers
+        if np.count_nonzero(inliers) < _MIN_MATCHES:
+            return None
+        side = max(camera.width, camera.height) / _CLUSTERS_ACROSS
+        column, row = np.floor(step.px[inliers] / side).astype(np.intp).T
+        try:
+            seen = _ABSORBED_ERROR_FACTOR * cov.clustered(
+                step.adjusted.jacobian[inliers],
+                step.adjusted.residuals_px[inliers],
+                step.adjusted.weights[inliers],
+                column * 10_000 + row,
+            )
+            full = np.linalg.inv(np.linalg.inv(seen) + self._upright.information)
+        except np.linalg.LinAlgError:
+            return None
+        if not (np.isfinite(full).all() and np.all(np.diag(full) > 0)):
+            return None
+        return np.asarray(full, dtype=np.float64)
+
+    def _search(self) -> list[Rigid3]:
+        """Poses to start level 1 from, the most promising first: peaks of the whole view's correlation there, over
+        turns of the heading."""
+        camera, field = self._query.cameras[1], self._query.fields[1]
+        predicted, sigma = self._predicted.local_from_camera, self._prior.heading_sigma_rad
+        steps = min(math.ceil(_SEARCH_SIGMAS * sigma / _TURN_STEP_RAD), _MAX_TURNS // 2)
+        candidates: list[tuple[float, Rigid3]] = []
+        with self._trace.stage("search"):
+            for turn in range(-steps, steps + 1):
+                turned = rotation.exp([0.0, 0.0, turn * _TURN_STEP_RAD]) @ predicted.rotation
+                view = render(self._terrain, camera, Rigid3(turned, predicted.translation))
+                if view.valid.mean() < _MIN_VALID:
+                    continue
+                template = orientation_field(view.image, view.valid)
+                middle = _middle_px(template)
+                for x, y, peak in structural.whole_shift(template, field, self._reach_px(view), _PEAKS_PER_TURN):
+                    candidates.append((peak, _moved_sideways(view, middle, np.array([x, y], dtype=np.float64))))
+        candidates.sort(key=lambda pair: -pair[0])
+        return [pose for _, pose in candidates[:_CANDIDATES]]
+
+
+def _middle_px(field: Float32Array) -> FloatArray:
+    """(1, 2): centre of what there is to see in a field."""
+    energy = np.square(field).sum(axis=0)
+    total = max(float(energy.sum()), 1e-9)
+    x = float(energy.sum(axis=0) @ np.arange(energy.shape[1])) / total
+    y = float(energy.sum(axis=1) @ np.arange(energy.shape[0])) / total
+    return np.array([[x, y]])
+
+
+def _moved_sideways(view: RenderedView, px: FloatArray, shift_px: FloatArray) -> Rigid3:
+    """The view's pose, moved across its optical axis so that what it shows at ``px`` (1, 2) is shown shifted."""
+    pose, camera = view.local_from_camera, view.camera
+    depth_m = float((view.points_local(px)[0] - pose.translation) @ pose.rotation[:, 2])
+    across = np.append(shift_px / (camera.fx, camera.fy), 0.0) * depth_m
+    return Rigid3(pose.rotation, pose.translation - pose.rotation @ across)
