@@ -59,7 +59,7 @@ def orientation_field(image: ImageArray, valid: BoolArray | None = None) -> Floa
     around = np.asarray(cv2.blur(cv2.blur(strength, window), window), dtype=np.float32)
     around += _NOISE
     for k in range(2):
-        np.divide(cv2.GaussianBlur(field[k], (0, 0), _SMOOTHING_PX), around, out=field[k])
+        cv2.divide(cv2.GaussianBlur(field[k], (7, 7), _SMOOTHING_PX), around, dst=field[k])
     _subtract_local_mean(field, inner)
     return field
 

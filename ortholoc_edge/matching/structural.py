@@ -7,6 +7,7 @@ overlapping patches cost nothing.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -17,6 +18,9 @@ from ortholoc_edge.geometry.arrays import Float32Array, FloatArray
 
 _MIN_ENERGY: Final = 1e-9
 _DOUBT: Final = 0.01
+# Shifts by one pixel, counted from (-1, -1), at which a patch is compared with itself: none, right, below, and along
+# either diagonal. Left and above are the same again, but for the patch's rim.
+_OWN_SHIFTS: Final = ((1, 1), (2, 1), (1, 2), (2, 2), (2, 0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,52 +55,134 @@ class Displacements:
         )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Correlation:
+    """How well every patch of a template fits at every shift tried.
+
+    Attributes:
+        template_px: (N, 2) middles of the patches, px.
+        scores: (D, D, N) normalised correlation by shift in y and x, from -radius to radius around ``origin``.
+        origin: (x, y) px.
+        sharpness: (N, 2, 2) how fast a patch stops fitting itself, per px^2.
+    """
+
+    template_px: FloatArray
+    scores: Float32Array
+    origin: tuple[int, int]
+    sharpness: FloatArray
+
+    @property
+    def radius(self) -> int:
+        return len(self.scores) // 2
+
+    def peaks(self) -> Displacements:
+        """The patches whose best shift lies inside, and whose score falls to all sides of it."""
+        kept, shift, score, curvature = _peaks(self.scores, self.radius)
+        return Displacements(self.template_px[kept], shift + self.origin, score, curvature)
+
+    def at(self, shift_px: FloatArray) -> tuple[FloatArray, FloatArray, np.ndarray]:
+        """Scores (N,) and their slopes (N, 2) per px at one shift (N, 2) of each patch, by the paraboloid through the
+        nearest shifts that were tried; and which (N,) lie inside what was tried. Elsewhere both are 0."""
+        place = shift_px - self.origin + self.radius
+        nearest = np.round(place)
+        inside = np.asarray(((nearest >= 1) & (nearest <= 2 * self.radius - 1)).all(axis=1))
+        column, row = np.where(inside[:, None], nearest, self.radius).astype(np.intp).T
+        patch = np.arange(len(place))
+
+        def value(dy: int, dx: int) -> FloatArray:
+            return np.asarray(self.scores[row + dy, column + dx, patch], dtype=np.float64)
+
+        centre, left, right, above, below = value(0, 0), value(0, -1), value(0, 1), value(-1, 0), value(1, 0)
+        slope = 0.5 * np.stack([right - left, below - above], axis=1)
+        xx, yy = left + right - 2.0 * centre, above + below - 2.0 * centre
+        xy = 0.25 * (value(1, 1) + value(-1, -1) - value(1, -1) - value(-1, 1))
+        bend = np.stack([np.stack([xx, xy], axis=1), np.stack([xy, yy], axis=1)], axis=1)
+        off = np.where(inside[:, None], place - np.where(inside[:, None], nearest, 0.0), 0.0)
+        turned = np.einsum("nij,nj->ni", bend, off)
+        score = centre + np.einsum("ni,ni->n", off, slope + 0.5 * turned)
+        return np.where(inside, score, 0.0), np.where(inside[:, None], slope + turned, 0.0), inside
+
+
 def correlate(
-    template: Float32Array, searched: Float32Array, *, radius: int, cell: int, patch_cells: int, origin: tuple[int, int] = (0, 0)
-) -> Displacements:
-    """Look for every patch of a field in another.
+    template: Float32Array,
+    searched: Float32Array,
+    *,
+    radius: int,
+    cell: int,
+    patch_cells: int,
+    stride: int = 1,
+    origin: tuple[int, int] = (0, 0),
+) -> Correlation:
+    """Compare every patch of a field with another field around where it is expected.
 
     Args:
         template, searched: (2, H, W) float32, of one shape.
-        radius: largest shift along each axis, px. Peaks at the rim count as not found.
-        cell: side of a cell, px; ``patch_cells`` of them side by side make a patch.
+        radius: largest shift along each axis, px.
+        cell: side of a cell, px; ``patch_cells`` of them side by side make a patch, and ``stride`` is how many lie between
+            the patches' first cells.
         origin: (x, y), added to the shifts that are tried.
-    Returns: the patches whose peak lies inside and falls to all sides.
     """
     rows, columns = template.shape[1] // cell, template.shape[2] // cell
     side = 2 * radius + 1
     if min(rows, columns) < patch_cells:
-        return _nothing()
+        return Correlation(np.empty((0, 2)), np.empty((side, side, 0), np.float32), origin, np.empty((0, 2, 2)))
     height, width = rows * cell, columns * cell
     fixed = template[:, :height, :width]
     around = _shifted_window(searched, radius, origin, height, width)
-    volume = np.empty((side, side, rows, columns), np.float32)
-    product, second = np.empty((2, height, width), np.float32)
-    for dy in range(side):
-        for dx in range(side):
-            moved = around[:, dy : dy + height, dx : dx + width]
-            np.multiply(fixed[0], moved[0], out=product)
-            np.multiply(fixed[1], moved[1], out=second)
-            product += second
-            volume[dy, dx] = cv2.resize(product, (columns, rows), interpolation=cv2.INTER_AREA)
-    own = np.square(fixed).sum(axis=0)
-    own_cells = cv2.resize(own, (columns, rows), interpolation=cv2.INTER_AREA)
-    other = np.square(around).sum(axis=0)
-    sums = cv2.boxFilter(other, -1, (cell, cell), anchor=(0, 0), normalize=True, borderType=cv2.BORDER_CONSTANT)
-    energy = np.empty_like(volume)
-    for dy in range(side):
-        for dx in range(side):
-            energy[dy, dx] = sums[dy : dy + height : cell, dx : dx + width : cell]
-    fixed_energy = _patches(own_cells, patch_cells)
-    scores = _patches(volume, patch_cells)
-    scores /= np.sqrt(np.maximum(_patches(energy, patch_cells) * fixed_energy, _MIN_ENERGY))
-    down, across = scores.shape[2:]
-    found = _peaks(scores.reshape(side, side, -1), radius)
-    middle = 0.5 * (patch_cells * cell - 1)
-    x, y = np.meshgrid(cell * np.arange(across) + middle, cell * np.arange(down) + middle)
-    places = np.column_stack([x.ravel(), y.ravel()])
-    kept, shift, score, curvature = found
-    return Displacements(places[kept], shift + origin, score, curvature)
+    every = [(dx, dy) for dy in range(side) for dx in range(side)]
+    scores = _patches(_products(fixed, around, every, cell), patch_cells, stride)
+    energy = _patches(_energies(around, radius, cell, height, width), patch_cells, stride)
+    own = _products(fixed, _shifted_window(template, 1, (0, 0), height, width), _OWN_SHIFTS, cell)
+    self_scores = _patches(own, patch_cells, stride)
+    fixed_energy = np.maximum(self_scores[0], _MIN_ENERGY)
+    scores /= np.sqrt(np.maximum(energy * fixed_energy, _MIN_ENERGY))
+    down, across = scores.shape[1:]
+    middle, step = 0.5 * (patch_cells * cell - 1), stride * cell
+    x, y = np.meshgrid(step * np.arange(across) + middle, step * np.arange(down) + middle)
+    return Correlation(
+        np.column_stack([x.ravel(), y.ravel()]),
+        scores.reshape(side, side, -1),
+        origin,
+        _sharpness((self_scores / fixed_energy).reshape(len(_OWN_SHIFTS), -1)),
+    )
+
+
+def _products(
+    fixed: Float32Array, around: Float32Array, shifts: Sequence[tuple[int, int]], cell: int
+) -> Float32Array:
+    """(S, rows, columns): mean product over each cell with what lies (x, y) px from the corner of ``around``."""
+    _, height, width = fixed.shape
+    size = width // cell, height // cell
+    volume = np.empty((len(shifts), size[1], size[0]), np.float32)
+    product = np.empty((height, width), np.float32)
+    for cells, (dx, dy) in zip(volume, shifts, strict=True):
+        moved = around[:, dy : dy + height, dx : dx + width]
+        cv2.multiply(fixed[0], moved[0], dst=product)
+        cv2.accumulateProduct(fixed[1], moved[1], product)
+        cv2.resize(product, size, dst=cells, interpolation=cv2.INTER_AREA)
+    return volume
+
+
+def _energies(around: Float32Array, radius: int, cell: int, height: int, width: int) -> Float32Array:
+    """(S, rows, columns): mean square over each cell, for every shift."""
+    side = 2 * radius + 1
+    squares = cv2.multiply(around[0], around[0])
+    cv2.accumulateProduct(around[1], around[1], squares)
+    means = cv2.boxFilter(squares, -1, (cell, cell), anchor=(0, 0), normalize=True, borderType=cv2.BORDER_CONSTANT)
+    return np.stack(
+        [means[dy : dy + height : cell, dx : dx + width : cell] for dy in range(side) for dx in range(side)]
+    )
+
+
+def _sharpness(own: Float32Array) -> FloatArray:
+    """(N, 2, 2) of how fast patches stop fitting themselves, from (S, N) scores with themselves at `_OWN_SHIFTS`."""
+    _, right, below, along, against = own.astype(np.float64)
+    xx, yy, xy = 2.0 - 2.0 * right, 2.0 - 2.0 * below, 0.5 * (against - along)
+    # A patch along one edge fits as well anywhere along it: rounding must not make that negative.
+    xx, yy = np.maximum(xx, 1e-6), np.maximum(yy, 1e-6)
+    limit = 0.999 * np.sqrt(xx * yy)
+    xy = np.clip(xy, -limit, limit)
+    return np.stack([np.stack([xx, xy], axis=1), np.stack([xy, yy], axis=1)], axis=1)
 
 
 def whole_shift(
@@ -144,13 +230,13 @@ def _shifted_window(
     return window
 
 
-def _patches(cells: Float32Array, count: int) -> Float32Array:
-    """Sums over ``count`` x ``count`` neighbours along the last two axes."""
+def _patches(cells: Float32Array, count: int, stride: int) -> Float32Array:
+    """Sums over ``count`` x ``count`` neighbours along the last two axes, at every ``stride``-th of them."""
     across = np.cumsum(cells, axis=-1, dtype=np.float64)
     across[..., count:] -= across[..., :-count].copy()
     total = np.cumsum(across[..., count - 1 :], axis=-2)
     total[..., count:, :] -= total[..., :-count, :].copy()
-    return np.asarray(total[..., count - 1 :, :], dtype=np.float32)
+    return np.asarray(total[..., count - 1 :: stride, ::stride], dtype=np.float32)
 
 
 def _peaks(
@@ -183,7 +269,3 @@ def _peaks(
     curvature[:, 0, 0], curvature[:, 1, 1] = xx[kept], yy[kept]
     curvature[:, 0, 1] = curvature[:, 1, 0] = xy[kept]
     return patch[kept], shift, centre[kept], curvature
-
-
-def _nothing() -> Displacements:
-    return Displacements(np.empty((0, 2)), np.empty((0, 2)), np.empty(0), np.empty((0, 2, 2)))

@@ -33,6 +33,9 @@ class GateOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     min_inliers: Annotated[int, Meta(ge=6)] = 30
     min_inlier_ratio: Annotated[float, Meta(ge=0, le=1)] = 0.20
+    # Of structural matching: part of the patches in view that agree with the pose. Right poses on the real flights have
+    # 0.45 or more, wrong ones in rows of trees up to 0.14 (docs/studies/structural.md).
+    min_support: Annotated[float, Meta(ge=0, le=1)] = 0.15
     # Convex hull of the inliers over the image's area.
     min_spread: Annotated[float, Meta(ge=0, le=1)] = 0.12
     # Root mean square of the inliers over the inlier threshold; uniform outliers give 0.71.
@@ -90,6 +93,13 @@ def enough_inliers(estimate: PoseEstimate, options: GateOptions) -> Refusal | No
     ratio = count / total
     if ratio < options.min_inlier_ratio:
         return Refusal(Reason.LOW_INLIER_RATIO, f"{count} of {total} matches", ratio, options.min_inlier_ratio)
+    return None
+
+
+def well_supported(support: float, options: GateOptions) -> Refusal | None:
+    """Chance, and a pattern that repeats, give some patches a place; the right pose gives it to most of them."""
+    if support < options.min_support:
+        return Refusal(Reason.LOW_INLIER_RATIO, "of the patches in view agree", support, options.min_support)
     return None
 
 

@@ -222,11 +222,14 @@ class Localizer:
         if found is None:
             raise RejectedError(Reason.FEW_MATCHES, "the map in the predicted view looks nothing like the frame")
         with trace.stage("gate"):
+            refusal = gate.well_supported(found.support, self._options.gate)
+            if refusal is not None:
+                raise RejectedError(refusal.reason, refusal.detail, refusal.measured, refusal.limit)
             solved = Solved(
                 found.query_px, local.map_from_local(found.points_local), found.estimate, len(found.query_px)
             )
             fix = self._fix(frame, solved, Scene(window, local, ground_m), prior)
-        return replace(fix, timings_ms=trace.timings_ms())
+        return replace(fix, quality=found.support, timings_ms=trace.timings_ms())
 
     def _query_fields(self, tracking: structural.QueryMaker, grey: ImageArray, trace: Trace) -> structural.QueryFields:
         with trace.stage("query_features"):

@@ -9,7 +9,7 @@ among turns, scales and shifts that the prior allows.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -25,18 +25,19 @@ from ortholoc_edge.matching.orientation import orientation_field
 from ortholoc_edge.pipeline.prior import MAX_RANGE_HEIGHTS, PosePrior
 from ortholoc_edge.pipeline.render import RenderedView, Terrain, render
 from ortholoc_edge.pipeline.trace import Trace
-from ortholoc_edge.pose.adjust import Adjusted, PoseMeasurement, adjust
+from ortholoc_edge.pose.adjust import Adjusted, PoseMeasurement, adjust, linearised, moved, normal_equations
 from ortholoc_edge.pose.pnp import PoseEstimate
 
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """Long side of the picture; radius, cell and cells per patch of `structural.correlate`."""
+    """Long side of the picture; radius, cell, cells per patch and stride of `structural.correlate`."""
 
     long_px: int
     radius_px: int
     cell_px: int
     patch_cells: int
+    stride: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,15 +48,17 @@ class Tuning:
     ``attitude``: the prior's attitude takes part in the pose that goes out.
     ``match_covariance``: a patch counts by how sharp its peak is, and not as all others.
     ``sigma_px``: standard deviation of a patch's place, px of the level, before that of its peak.
+    ``polish``: the last level's pose is where all patches together fit best.
     ``edge_weight``: of patches whose middle lies at a jump of the surface, where a 2.5D map is doubtful.
     """
 
-    levels: tuple[Level, ...] = (Level(128, 6, 8, 6), Level(256, 3, 8, 6), Level(512, 2, 16, 3))
+    levels: tuple[Level, ...] = (Level(128, 6, 8, 6), Level(256, 3, 8, 6, 2), Level(512, 2, 16, 3))
     render_again: bool = True
     attitude: bool = True
     match_covariance: bool = True
     sigma_px: float = 0.2
     edge_weight: float = 1.0
+    polish: bool = True
 
 
 TUNING = Tuning()
@@ -65,7 +68,7 @@ _MIN_SCORE = 0.2
 _WHOLE_SIGMA_PX = 2.0
 # Scales of the robust loss in px: wide first, where the whole picture may still be turned by some degrees.
 _FIRST_SCALES_PX = (6.0, 2.5, 1.2)
-_LATER_SCALES_PX = (2.5, 1.2, 0.9)
+_LATER_SCALES_PX = (2.5, 1.0)
 # Part of a view that must show map.
 _MIN_VALID = 0.1
 _MIN_MATCHES = 5
@@ -79,7 +82,7 @@ _MIN_REACH, _MAX_REACH = 0.08, 0.45
 # tracks on the real flights 1 % had fewer than 162 and 0.78; of 344 frames shown where they do not belong the best had
 # 17 (docs/studies/structural.md).
 _CONVINCING_MATCHES = 60
-_CONVINCING_RATIO = 0.67
+_CONVINCING_SUPPORT = 0.35
 _CONVINCING_BEFORE = 0.5
 # A search turns the view by steps, within so many sigmas of the heading, and follows so many of the best peaks.
 _SEARCH_SIGMAS = 2.5
@@ -87,10 +90,19 @@ _TURN_STEP_RAD = math.radians(7.0)
 _MAX_TURNS = 9
 _PEAKS_PER_TURN = 2
 _CANDIDATES = 4
+# Of the last level's patches: independent samples (48 x 48 px, correlated over 3, shared with neighbours), and the
+# highest correlation that counts.
+_SAMPLES = 80.0
+_MAX_SCORE = 0.98
+_POLISHES = 4
+# In standard deviations: what moves the pose by less changes nothing.
+_SMALL_CHANGE = 0.02
 # Matches closer than a fifth of the long side share the errors of a patch of the map and of the camera's model.
 _CLUSTERS_ACROSS = 5
-# As in `pose.pnp`: errors that vary slowly are absorbed by the pose.
+# On the variance, as in `pose.pnp`: errors that vary slowly are absorbed by the pose. The worse the patches fit, the
+# more of them are another season's shadows and crowns, which err alike.
 _ABSORBED_ERROR_FACTOR = 2.5
+_DOUBTFUL_SCORE, _DOUBT_POWER = 0.38, 8
 # Also where a prior claims to be exact there is something to divide by: 1 mm, 1e-5 rad.
 _EXACT = np.diag([1e-6] * 3 + [1e-10] * 3)
 
@@ -147,14 +159,16 @@ class Track:
     Attributes:
         estimate: at the frame's full size.
         query_px: (M, 2) px of the frame without distortion; points_local: (M, 3).
-        looked_for: patches that could have been found.
+        support: part of the patches in view that agree with the pose.
+        score: median of how well those fit, at most 1.
         convincing: whether other ways need not be tried.
     """
 
     estimate: PoseEstimate
     query_px: FloatArray
     points_local: FloatArray
-    looked_for: int
+    support: float
+    score: float
     convincing: bool
 
     @property
@@ -164,11 +178,14 @@ class Track:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Step:
-    """One level's outcome: matches (N) of level px and local points, and which agree with the pose."""
+    """One level's outcome: matches (N) of level px and local points, how well they fit, how sure their places are, and
+    which agree with the pose; and how many patches were in view."""
 
     adjusted: Adjusted
     px: FloatArray
     points: FloatArray
+    scores: FloatArray
+    information: FloatArray
     inliers: BoolArray
     looked_for: int
 
@@ -260,10 +277,48 @@ class Tracking:
                 radius=level.radius_px,
                 cell=level.cell_px,
                 patch_cells=level.patch_cells,
+                stride=level.stride,
                 origin=whole or (0, 0),
             )
         with self._trace.stage("pose"):
-            return self._adjusted(number, view, found, template, known, pose, whole if number == 0 else None)
+            step = self._adjusted(number, view, found, template, known, pose, whole if number == 0 else None)
+            if step is None or not self._tuning.polish or number < len(self._tuning.levels) - 1:
+                return step
+            return self._polished(view, found, known, step)
+
+    def _polished(
+        self, view: RenderedView, found: structural.Correlation, known: PoseMeasurement, step: _Step
+    ) -> _Step:
+        """The pose at which all patches together fit best, and not only those with a peak of their own.
+
+        The likelihood of a patch of n independent samples at correlation r is ``(1 - r^2)^(-n/2)``; its slope and its
+        expected curvature, of the patch's own sharpness, give Newton's step for the pose.
+        """
+        pose = step.adjusted.local_from_camera
+        points, shown = view.points_local(found.template_px), _shown(view, found.template_px)
+        for _ in range(_POLISHES):
+            shift, jacobian = linearised(points, found.template_px, view.camera, pose)
+            score, slope, inside = found.at(np.where(np.isfinite(shift), shift, np.inf))
+            score = np.where(inside & shown, np.clip(score, 0.0, _MAX_SCORE), 0.0)
+            strength = _SAMPLES * score / (1.0 - score**2)
+            normal, _ = normal_equations(jacobian, (strength * score)[:, None, None] * found.sharpness, shift * 0.0)
+            rise = (strength[:, None] * slope).ravel() @ jacobian.reshape(-1, 6)
+            normal += known.information
+            try:
+                change = np.linalg.solve(normal, rise - known.information @ known.error(pose))
+            except np.linalg.LinAlgError:
+                return step
+            if not np.isfinite(change).all():
+                return step
+            pose = moved(pose, change)
+            if float(change @ normal @ change) < _SMALL_CHANGE**2:
+                break
+        residuals, jacobian = linearised(step.points, step.px, view.camera, pose)
+        return replace(
+            step,
+            adjusted=replace(step.adjusted, local_from_camera=pose, residuals_px=residuals, jacobian=jacobian),
+            inliers=np.asarray(np.linalg.norm(residuals, axis=1) <= _LAST_INLIER_PX),
+        )
 
     def _middle_shift(self, view: RenderedView, template: Float32Array, pose: Rigid3) -> tuple[int, int]:
         middle = _middle_px(template)
@@ -286,19 +341,18 @@ class Tracking:
         self,
         number: int,
         view: RenderedView,
-        found: structural.Displacements,
+        found: structural.Correlation,
         template: Float32Array,
         known: PoseMeasurement,
         pose: Rigid3,
         whole: tuple[int, int] | None,
     ) -> _Step | None:
         level = self._tuning.levels[number]
-        column, row = np.round(found.template_px).astype(np.intp).T
-        shown = view.valid[row, column]
-        found_well = found.take(np.flatnonzero(shown & (found.score >= _MIN_SCORE)))
+        peaks = found.peaks()
+        found_well = peaks.take(np.flatnonzero(_shown(view, peaks.template_px) & (peaks.score >= _MIN_SCORE)))
         px, seen_px = found_well.template_px, found_well.template_px + found_well.shift_px
         # Patches overlap: so many share their pixels.
-        shared = level.patch_cells**2 / 4.0
+        shared = max((level.patch_cells / level.stride) ** 2 / 4.0, 1.0)
         information = self._information(view, found_well) / shared
         if whole is not None:
             middle = _middle_px(template)
@@ -326,8 +380,10 @@ class Tracking:
             adjusted,
             seen_px[: len(found_well)],
             points[: len(found_well)],
+            found_well.score,
+            information[: len(found_well)],
             np.asarray(inliers),
-            int(np.count_nonzero(shown)),
+            int(np.count_nonzero(_shown(view, found.template_px))),
         )
 
     def _information(self, view: RenderedView, found: structural.Displacements) -> FloatArray:
@@ -357,12 +413,14 @@ class Tracking:
             errors,
             float(np.sqrt(np.mean(errors[last.inliers] ** 2))),
         )
+        support = count / max(last.looked_for, 1)
         convincing = (
             count >= _CONVINCING_MATCHES
-            and last.agreeing >= _CONVINCING_RATIO
+            and support >= _CONVINCING_SUPPORT
             and all(step.agreeing >= _CONVINCING_BEFORE for step in steps)
         )
-        return Track(estimate, resize_px(last.px, scale), last.points, last.looked_for, convincing)
+        score = float(np.median(last.scores[last.inliers]))
+        return Track(estimate, resize_px(last.px, scale), last.points, support, score, convincing)
 
     def _covariance(self, step: _Step, camera: Camera) -> FloatArray | None:
         """(6, 6): of what was seen, together with the attitude that was known; None if that determines no pose."""
@@ -371,10 +429,12 @@ class Tracking:
             return None
         side = max(camera.width, camera.height) / _CLUSTERS_ACROSS
         column, row = np.floor(step.px[inliers] / side).astype(np.intp).T
+        # Whitened, so that a patch along an edge counts across it.
+        whitener = np.linalg.cholesky(step.information[inliers]).transpose(0, 2, 1)
         try:
-            seen = _ABSORBED_ERROR_FACTOR * cov.clustered(
-                step.adjusted.jacobian[inliers],
-                step.adjusted.residuals_px[inliers],
+            seen = _absorbed_error_factor(step.scores[inliers]) * cov.clustered(
+                whitener @ step.adjusted.jacobian[inliers],
+                np.einsum("nij,nj->ni", whitener, step.adjusted.residuals_px[inliers]),
                 step.adjusted.weights[inliers],
                 column * 10_000 + row,
             )
@@ -404,6 +464,16 @@ class Tracking:
                     candidates.append((peak, _moved_sideways(view, middle, np.array([x, y], dtype=np.float64))))
         candidates.sort(key=lambda pair: -pair[0])
         return [pose for _, pose in candidates[:_CANDIDATES]]
+
+
+def _absorbed_error_factor(scores: FloatArray) -> float:
+    return _ABSORBED_ERROR_FACTOR * (1.0 + (_DOUBTFUL_SCORE / float(np.median(scores))) ** _DOUBT_POWER)
+
+
+def _shown(view: RenderedView, px: FloatArray) -> BoolArray:
+    """Which pixels (N, 2) of a view show map."""
+    column, row = np.round(px).astype(np.intp).T
+    return np.asarray(view.valid[row, column])
 
 
 def _middle_px(field: Float32Array) -> FloatArray:

@@ -86,7 +86,7 @@ def adjust(
     Returns: None if the pose is not determined.
     """
     pose = start
-    residuals, jacobian = _linearised(points_local, px, camera, pose)
+    residuals, jacobian = linearised(points_local, px, camera, pose)
     weights = np.ones(len(px))
     for number, scale in enumerate(scales):
         last = number == len(scales) - 1
@@ -95,29 +95,41 @@ def adjust(
             safe = np.where(usable[:, None], residuals, 0.0)
             whitened = np.einsum("nij,nj->ni", information, safe)
             weights = np.where(usable, _geman_mcclure(np.einsum("ni,ni->n", safe, whitened), scale), 0.0)
-            weighted = (jacobian.transpose(0, 2, 1) @ (information * weights[:, None, None])).transpose(0, 2, 1)
-            flat = weighted.reshape(-1, 6)
-            normal = flat.T @ jacobian.reshape(-1, 6) + measured.information
-            gradient = flat.T @ safe.ravel() + measured.information @ measured.error(pose)
+            normal, gradient = normal_equations(jacobian, information * weights[:, None, None], safe)
+            normal += measured.information
+            gradient += measured.information @ measured.error(pose)
             try:
                 step = -np.linalg.solve(normal, gradient)
             except np.linalg.LinAlgError:
                 return None
             if not np.isfinite(step).all():
                 return None
-            pose = Rigid3(rotation.exp(step[3:]) @ pose.rotation, pose.translation + step[:3])
-            residuals, jacobian = _linearised(points_local, px, camera, pose)
+            pose = moved(pose, step)
+            residuals, jacobian = linearised(points_local, px, camera, pose)
             if last and float(step @ normal @ step) < _SMALL_STEP**2:
                 break
     return Adjusted(pose, residuals, weights, jacobian)
+
+
+def normal_equations(
+    jacobian: FloatArray, information: FloatArray, residuals: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """``sum J^T W J`` (6, 6) and ``sum J^T W r`` (6,) of (N, 2, 6), (N, 2, 2) and (N, 2)."""
+    flat = (information @ jacobian).reshape(-1, 6)
+    return flat.T @ jacobian.reshape(-1, 6), flat.T @ residuals.ravel()
+
+
+def moved(pose: Rigid3, step: FloatArray) -> Rigid3:
+    """A pose after a step (6,) of centre and rotation vector."""
+    return Rigid3(rotation.exp(step[3:]) @ pose.rotation, pose.translation + step[:3])
 
 
 def _geman_mcclure(squared: FloatArray, scale: float) -> FloatArray:
     return np.asarray((scale**2 / (scale**2 + squared)) ** 2, dtype=np.float64)
 
 
-def _linearised(points: FloatArray, px: FloatArray, camera: Camera, pose: Rigid3) -> tuple[FloatArray, FloatArray]:
-    """Residuals (N, 2), infinite behind the camera, and their Jacobian (N, 2, 6), 0 there, by camera centre and
+def linearised(points: FloatArray, px: FloatArray, camera: Camera, pose: Rigid3) -> tuple[FloatArray, FloatArray]:
+    """Residuals (N, 2) of points (N, 3) seen at px (N, 2), infinite behind the camera, and their Jacobian (N, 2, 6), 0 there, by camera centre and
     rotation vector (both in map axes, ``R = exp(d) R``)."""
     from_centre = points - pose.translation
     x, y, z = (from_centre @ pose.rotation).T
@@ -136,5 +148,10 @@ def _linearised(points: FloatArray, px: FloatArray, camera: Camera, pose: Rigid3
         axis=1,
     )
     # d(R^T exp(-d) (P - C)) = R^T skew(P - C) d, and a row r times skew(p) is r x p.
-    by_turn = np.cross(by_point, from_centre[:, None, :])
-    return residuals, np.concatenate([-by_point, by_turn], axis=2)
+    jacobian = np.empty((len(points), 2, 6))
+    jacobian[:, :, :3] = -by_point
+    for axis, (one, other) in enumerate(((1, 2), (2, 0), (0, 1))):
+        jacobian[:, :, 3 + axis] = (
+            by_point[:, :, one] * from_centre[:, None, other] - by_point[:, :, other] * from_centre[:, None, one]
+        )
+    return residuals, jacobian

@@ -5,9 +5,9 @@ A map (DOP, DSM) of a generated place at one time and photos of it with their tr
 OrthoLoC paper:
 
     same     the photos show the world of the map; only the sensors differ
-    xDOP     another season and hour (crops, leaves, grass, cast shadows), roofs repainted, cars moved, some trees
-             felled or new, another camera; buildings and terrain as in the DSM
-    xDOPDSM  besides, both layers of the map are older and coarser than the photos: buildings new or gone, more trees
+    xDOP     the DOP shows another season and hour (crops, leaves, grass, cast shadows), other roofs, cars and trees, by
+             another camera; the DSM is of the photos' time
+    xDOPDSM  both layers of the map are older and coarser than the photos: buildings new or gone, more trees
              felled, the others grown, the DSM smoothed and noisy
 
 Place, map and poses follow from the seed alone, so the kinds of one seed differ in nothing else.
@@ -179,8 +179,9 @@ class CrossDomain:
             replace(self.place.world, layout=flight_layout(self.place, self.kind, self.flight)), self.flight
         )
 
-    def layers(self, scene: Scene) -> MapLayers:
-        """The map of the scene of ``survey``."""
+    def layers(self, scene: Scene, surface: Float32Array) -> MapLayers:
+        """The map: its DOP of the scene of ``survey``, its DSM of the ``surface`` of a scene: the flight's for xDOP, where
+        a crop that is a metre lower would move the photos, else the survey's."""
         west, north = self.place.west_m, self.place.south_m + self.height_m
         columns, rows = round(self.width_m / DOP_GSD_M), round(self.height_m / DOP_GSD_M)
         # A survey's orthophoto is resampled from pictures: it has no detail at its own pixel.
@@ -188,7 +189,7 @@ class CrossDomain:
         dop = cv2.resize(soft, (columns, rows), interpolation=cv2.INTER_AREA)
         dop_grid = RasterGrid(columns, rows, west, north, DOP_GSD_M, -DOP_GSD_M)
         columns, rows = round(self.width_m / DSM_GSD_M), round(self.height_m / DSM_GSD_M)
-        dsm = np.asarray(cv2.resize(scene.surface, (columns, rows), interpolation=cv2.INTER_AREA), dtype=np.float32)
+        dsm = np.asarray(cv2.resize(surface, (columns, rows), interpolation=cv2.INTER_AREA), dtype=np.float32)
         dsm_grid = RasterGrid(columns, rows, west, north, DSM_GSD_M, -DSM_GSD_M)
         rng = np.random.default_rng([self.seed, 111])
         white = rng.standard_normal(dsm.shape, dtype=np.float32)
@@ -334,10 +335,9 @@ def write_set(out: Path, domain: CrossDomain, count: int, progress: bool = False
     (out / "queries").mkdir(parents=True, exist_ok=True)
     name = out.resolve().name
     scene = domain.survey_scene()
-    _write_layers(out, name, domain.layers(scene))
-    if domain.kind is not Kind.SAME:
-        del scene  # half a gigabyte
-        scene = domain.flight_scene()
+    flown = scene if domain.kind is Kind.SAME else domain.flight_scene()
+    _write_layers(out, name, domain.layers(scene, (flown if domain.kind is Kind.XDOP else scene).surface))
+    scene = flown  # the survey's half gigabyte is done with
     renderer = domain.renderer(scene)
     start = datetime(2024, 1, 1) + timedelta(days=domain.flown.season.day - 1, hours=9)
     with (out / f"{name}_flight.csv").open("w", newline="", encoding="utf-8") as file:

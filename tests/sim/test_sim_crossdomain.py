@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import rasterio
 from ortholoc_sim.camera import Placement, Renderer, Sensor, View
 from ortholoc_sim.crossdomain import (
     DSM_GSD_M,
@@ -241,7 +242,7 @@ def test_xdopdsm_builds_tears_down_and_grows() -> None:
 
 def test_old_dsm_is_smooth_and_noisy_and_the_others_are_not() -> None:
     scene = SAME.survey_scene()
-    layers = {domain.kind: domain.layers(scene) for domain in (SAME, SMALL, OLD)}
+    layers = {domain.kind: domain.layers(scene, scene.surface) for domain in (SAME, SMALL, OLD)}
     np.testing.assert_array_equal(layers[Kind.SAME].dsm, layers[Kind.XDOP].dsm)
     for kind in (Kind.XDOP, Kind.XDOPDSM):
         np.testing.assert_array_equal(layers[kind].dop, layers[Kind.SAME].dop)
@@ -254,6 +255,15 @@ def test_old_dsm_is_smooth_and_noisy_and_the_others_are_not() -> None:
     assert spread[Kind.XDOPDSM] > spread[Kind.SAME] + 0.03
     difference = (layers[Kind.XDOPDSM].dsm - layers[Kind.SAME].dsm)[clear]
     assert 0.2 < float(difference.std()) < 0.45
+
+
+def test_xdop_has_the_surface_of_the_photos_and_the_picture_of_the_survey(tmp_path: Path) -> None:
+    write_set(tmp_path / "set", SMALL, 1)
+    flown, surveyed = SMALL.flight_scene(), SMALL.survey_scene()
+    expected = SMALL.layers(surveyed, flown.surface)
+    with rasterio.open(tmp_path / "set" / "set_dsm.tif") as source:
+        np.testing.assert_array_equal(source.read(1), expected.dsm)
+    assert np.abs(expected.dsm - SMALL.layers(surveyed, surveyed.surface).dsm).max() > 0.5
 
 
 @pytest.mark.parametrize("gsd_m", [0.2, 0.125, 0.3])
