@@ -69,7 +69,7 @@ def overlay(image: ImageArray, outcome: Outcome, truth: Rigid3 | None, camera: C
                     cv2.line(canvas, _at(a), _at(b), DIFFERENCE, 1, cv2.LINE_AA)
             _dots(canvas, true, TRUTH, 3)
         _dots(canvas, estimated, ESTIMATE, 2)
-    return _captioned(canvas, caption)
+    return captioned(canvas, caption)
 
 
 def track(store: MapStore, tracks: Sequence[Track], caption: str) -> ImageArray:
@@ -100,7 +100,7 @@ def track(store: MapStore, tracks: Sequence[Track], caption: str) -> ImageArray:
             _dots(canvas, px, one.colour, 4)
     georeference = store.pack.georeference
     _furniture(canvas, grid, georeference.convergence_rad(georeference.anchor), tracks)
-    return _captioned(canvas, caption)
+    return captioned(canvas, caption)
 
 
 def write_png(path: Path, image: ImageArray) -> None:
@@ -126,7 +126,8 @@ def _dots(canvas: ImageArray, px: FloatArray, colour: Colour, radius: int) -> No
         cv2.circle(canvas, _at(point), radius, colour, -1, cv2.LINE_AA)
 
 
-def _captioned(canvas: ImageArray, caption: str) -> ImageArray:
+def captioned(canvas: ImageArray, caption: str) -> ImageArray:
+    """A picture with a line of text above it."""
     scale = max(canvas.shape[1] / 1600, 0.45)
     strip = np.full((round(40 * scale), canvas.shape[1], 3), _PAPER, dtype=np.uint8)
     # OpenCV's fonts know ASCII only.

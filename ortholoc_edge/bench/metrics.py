@@ -113,11 +113,13 @@ def pose_error(fix: Fix, truth: Rigid3) -> PoseError:
     )
 
 
-def recall(errors: Sequence[PoseError], frames: int) -> dict[str, float]:
-    """Part of all frames with a fix within each pair of limits."""
+def recall(
+    errors: Sequence[PoseError], frames: int, limits: Mapping[str, tuple[float, float]] = RECALL_LIMITS
+) -> dict[str, float]:
+    """Part of all frames with a fix within each pair of limits (m, deg)."""
     return {
         name: sum(e.te_m <= metres and e.re_deg <= degrees for e in errors) / frames if frames else 0.0
-        for name, (metres, degrees) in RECALL_LIMITS.items()
+        for name, (metres, degrees) in limits.items()
     }
 
 

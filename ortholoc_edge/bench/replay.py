@@ -98,6 +98,7 @@ class FrameResult:
         error: None without a fix.
         prior: where it was predicted; None if nowhere.
         cpu_ms: of this process, all threads.
+        wall_ms: for the same work.
     """
 
     name: str
@@ -109,6 +110,18 @@ class FrameResult:
     outcome: Outcome
     error: PoseError | None
     cpu_ms: float
+    wall_ms: float
+
+
+class Timer:
+    """CPU time of this process, all threads, and wall time since it was made."""
+
+    def __init__(self) -> None:
+        self._cpu_s, self._wall_s = time.process_time(), time.perf_counter()
+
+    def spent_ms(self) -> tuple[float, float]:
+        """CPU and wall, ms."""
+        return (time.process_time() - self._cpu_s) * 1e3, (time.perf_counter() - self._wall_s) * 1e3
 
 
 class SimulatedAutopilot:
@@ -194,7 +207,7 @@ def replay_flight(
             georeference.convergence_rad(xy),
             georeference.grid_scale(xy, float(truth.translation[2])),
         )
-        start = time.process_time()
+        timer = Timer()
         prior: PosePrior | None = None
         image: ImageArray | None = None
         outcome: Outcome
@@ -216,10 +229,11 @@ def replay_flight(
                 navigator = Navigator(localizer, tracker)
                 outcome = navigator.step(frame, state)
                 prior = navigator.prior
-        cpu_ms = (time.process_time() - start) * 1e3
+        spent_ms = timer.spent_ms()
         yield FrameResult(
-            record.name, record.stamp_ns, image, record.camera, truth, prior, outcome, _error(outcome, truth), cpu_ms
-        )
+            record.name, record.stamp_ns, image, record.camera, truth, prior, outcome, outcome_error(outcome, truth),
+            *spent_ms,
+        )  # fmt: skip
 
 
 def _tracker_options(noise: PriorNoise) -> TrackerOptions:
@@ -245,11 +259,11 @@ def replay_sample(
     frame = Frame(0, sample.image, sample.name)
     truth = sample.map_from_camera
     prior = None if kind is PriorKind.NONE else noisy_prior(truth, height_m, noise, np.random.default_rng(seed))
-    start = time.process_time()
+    timer = Timer()
     outcome = localizer.localize(frame, RegionPrior(bounds) if prior is None else prior)
-    cpu_ms = (time.process_time() - start) * 1e3
+    spent_ms = timer.spent_ms()
     return FrameResult(
-        sample.name, 0, sample.image, sample.camera, truth, prior, outcome, _error(outcome, truth), cpu_ms
+        sample.name, 0, sample.image, sample.camera, truth, prior, outcome, outcome_error(outcome, truth), *spent_ms
     )
 
 
@@ -289,5 +303,6 @@ def _perturbed(ned_from_body: FloatArray, roll: float, pitch: float, yaw: float)
     return np.asarray(rotation.exp(axis) @ ned_from_body, dtype=np.float64)
 
 
-def _error(outcome: Outcome, truth: Rigid3) -> PoseError | None:
+def outcome_error(outcome: Outcome, truth: Rigid3) -> PoseError | None:
+    """None without a fix."""
     return pose_error(outcome, truth) if isinstance(outcome, Fix) else None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from ortholoc_edge.matching.types import AnyMatcher
 from ortholoc_edge.pipeline.localizer import Localizer, LocalizerOptions
 from ortholoc_edge.pose import pnp
 from ortholoc_edge.tiles.build import PackOptions, build_pack
+from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.store import MapStore
 
 # What a summary names as its pack where each sample brings one.
@@ -41,25 +42,34 @@ def run_flight(
     seed: int,
 ) -> Iterator[FrameResult]:
     """Localize a recorded flight on a pack. See `replay.replay_flight`."""
-    localizers: dict[Camera, Localizer] = {}
-
-    def localizer_for(camera: Camera) -> Localizer:
-        if camera not in localizers:
-            localizers[camera] = Localizer(camera, store, matcher, options)
-        return localizers[camera]
-
-    try:
+    with localizers(store, matcher, options) as localizer_for:
         yield from replay_flight(
             recorded,
             localizer_for,
             store.pack.georeference,
-            lambda xy: _ground(store, xy),
+            lambda xy: true_ground(store, xy),
             kind=kind,
             noise=noise,
             seed=seed,
         )
+
+
+@contextmanager
+def localizers(
+    store: MapStore, matcher: AnyMatcher, options: LocalizerOptions
+) -> Iterator[Callable[[Camera], Localizer]]:
+    """A localizer for each camera that is asked for, made once and closed at the end."""
+    made: dict[Camera, Localizer] = {}
+
+    def localizer_for(camera: Camera) -> Localizer:
+        if camera not in made:
+            made[camera] = Localizer(camera, store, matcher, options)
+        return made[camera]
+
+    try:
+        yield localizer_for
     finally:
-        for localizer in localizers.values():
+        for localizer in made.values():
             localizer.close()
 
 
@@ -82,7 +92,7 @@ def run_samples(
         sample = sequence.read_sample(path)
         with sample_store(sample) if pack is None else nullcontext(pack) as store:
             localizer = Localizer(sample.camera, store, matcher, options)
-            ground_m = _ground(store, sample.map_from_camera.translation[:2])
+            ground_m = true_ground(store, sample.map_from_camera.translation[:2])
             try:
                 yield replay_sample(
                     sample,
@@ -97,7 +107,8 @@ def run_samples(
                 localizer.close()
 
 
-def _ground(store: MapStore, xy_map: FloatArray) -> float:
+def true_ground(store: MapStore, xy_map: FloatArray) -> float:
+    """Typical height of the surface around a frame's true position, m. Raises: DatasetError if there is none."""
     ground_m = store.ground_near(xy_map)
     if ground_m is None:
         raise DatasetError(
@@ -110,33 +121,38 @@ def _ground(store: MapStore, xy_map: FloatArray) -> float:
 @contextmanager
 def sample_store(sample: sequence.Sample) -> Iterator[MapStore]:
     """A sample's rasters as an area pack without a reference system, for as long as it is needed."""
-    with tempfile.TemporaryDirectory(prefix="ortholoc-sample-") as name:
-        folder = Path(name)
-        grid = sample.grid
-        transform = Affine(grid.dx, 0.0, grid.west, 0.0, grid.dy, grid.top)
-        # Named after the sample, for the builder's messages name files.
-        dop, dsm = folder / f"{sample.name} image_dop.tif", folder / f"{sample.name} dsm.tif"
-        for file, bands, dtype in (
-            (dop, np.moveaxis(sample.dop, 2, 0), "uint8"),
-            (dsm, sample.dsm[None], "float32"),
-        ):
-            profile = {
-                "driver": "GTiff",
-                "width": grid.width,
-                "height": grid.height,
-                "count": len(bands),
-                "dtype": dtype,
-                "transform": transform,
-                "nodata": np.nan if dtype == "float32" else None,
-            }
-            try:
-                with rasterio.open(file, "w", **profile) as target:
-                    target.write(bands)
-            except rasterio.errors.RasterioError as err:
-                raise MapError(f"{sample.name}: can't write {file} ({err}); is the disk full?") from err
-        pack = build_pack(dop, dsm, folder / "pack", PackOptions(quality=95, vertical="unknown"))
-        with MapStore(pack) as store:
-            yield store
+    with (
+        tempfile.TemporaryDirectory(prefix="ortholoc-sample-") as name,
+        MapStore(build_sample_pack(sample, Path(name))) as store,
+    ):
+        yield store
+
+
+def build_sample_pack(sample: sequence.Sample, folder: Path) -> Pack:
+    """A sample's rasters as an area pack without a reference system, in ``folder``/pack."""
+    grid = sample.grid
+    transform = Affine(grid.dx, 0.0, grid.west, 0.0, grid.dy, grid.top)
+    # Named after the sample, for the builder's messages name files.
+    dop, dsm = folder / f"{sample.name} image_dop.tif", folder / f"{sample.name} dsm.tif"
+    for file, bands, dtype in (
+        (dop, np.moveaxis(sample.dop, 2, 0), "uint8"),
+        (dsm, sample.dsm[None], "float32"),
+    ):
+        profile = {
+            "driver": "GTiff",
+            "width": grid.width,
+            "height": grid.height,
+            "count": len(bands),
+            "dtype": dtype,
+            "transform": transform,
+            "nodata": np.nan if dtype == "float32" else None,
+        }
+        try:
+            with rasterio.open(file, "w", **profile) as target:
+                target.write(bands)
+        except rasterio.errors.RasterioError as err:
+            raise MapError(f"{sample.name}: can't write {file} ({err}); is the disk full?") from err
+    return build_pack(dop, dsm, folder / "pack", PackOptions(quality=95, vertical="unknown"))
 
 
 def summarise(

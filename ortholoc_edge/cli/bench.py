@@ -6,7 +6,7 @@ import argparse
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -17,9 +17,10 @@ from tqdm import tqdm
 from ortholoc_edge.bench import metrics, sequence
 from ortholoc_edge.bench.replay import FrameResult, PriorKind, PriorNoise
 from ortholoc_edge.bench.runner import SAMPLES_PACK, prior_used, run_flight, run_samples, summarise
+from ortholoc_edge.bench.sets import RecordedSet, find_sets
 from ortholoc_edge.cli.arguments import positive_int
 from ortholoc_edge.cli.progress import ProgressBar
-from ortholoc_edge.errors import DatasetError, OrtholocError
+from ortholoc_edge.errors import OrtholocError
 from ortholoc_edge.matching.registry import METHODS, make_method
 from ortholoc_edge.matching.types import AnyMatcher
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
@@ -31,16 +32,6 @@ _HEADING = (
     "false fixes | NEES mean (6) | CPU ms |\n"
     "|---|---|---|---|---|---|---|---|---|---|---|---|---|"
 )
-
-
-@dataclass(frozen=True, slots=True)
-class _Set:
-    """A flight with its two rasters, or a folder of samples."""
-
-    name: str
-    folder: Path
-    dop: Path | None
-    dsm: Path | None
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -74,7 +65,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
-    found = _sets(args.data)
+    found = find_sets(args.data)
     # Before the sets: what is wrong here is wrong for all of them.
     matchers = {name: _matcher(name, args) for name in args.matchers}
     if not args.json:
@@ -92,23 +83,6 @@ def run(args: argparse.Namespace) -> int:
     return 1 if failed else 0
 
 
-def _sets(data: Path) -> list[_Set]:
-    found: dict[Path, _Set] = {}
-    for folder in sorted(path for path in [data, *data.glob("*")] if path.is_dir()):
-        name = folder.resolve().name
-        dop, dsm = sorted(folder.glob("*_dop.tif")), sorted(folder.glob("*_dsm.tif"))
-        if list(folder.glob("*_flight.csv")) and dop and dsm:
-            found.setdefault(folder, _Set(name, folder, dop[0], dsm[0]))
-        elif sequence.sample_paths(folder):
-            found.setdefault(folder, _Set(name, folder, None, None))
-        samples = folder / "samples"
-        if sequence.sample_paths(samples):
-            found.setdefault(samples, _Set(f"{name} samples", samples, None, None))
-    if not found:
-        raise DatasetError(f"{data}: no set there; see docs/sequences.md")
-    return list(found.values())
-
-
 def _matcher(name: str, args: argparse.Namespace) -> AnyMatcher:
     with ProgressBar(f"model {name}") as bar:
         return make_method(
@@ -116,7 +90,7 @@ def _matcher(name: str, args: argparse.Namespace) -> AnyMatcher:
         )
 
 
-def _measure(one: _Set, matchers: Mapping[str, AnyMatcher], scratch: Path, args: argparse.Namespace) -> None:
+def _measure(one: RecordedSet, matchers: Mapping[str, AnyMatcher], scratch: Path, args: argparse.Namespace) -> None:
     store = _store(one, scratch)
     try:
         for summary in _rows(one, store, matchers, args):
@@ -126,14 +100,14 @@ def _measure(one: _Set, matchers: Mapping[str, AnyMatcher], scratch: Path, args:
             store.close()
 
 
-def _store(one: _Set, scratch: Path) -> MapStore | None:
+def _store(one: RecordedSet, scratch: Path) -> MapStore | None:
     if one.dop is None or one.dsm is None:
         return None
     return MapStore(build_pack(one.dop, one.dsm, scratch / one.name, PackOptions(quality=85, vertical="unknown")))
 
 
 def _rows(
-    one: _Set, store: MapStore | None, matchers: Mapping[str, AnyMatcher], args: argparse.Namespace
+    one: RecordedSet, store: MapStore | None, matchers: Mapping[str, AnyMatcher], args: argparse.Namespace
 ) -> Iterator[metrics.Summary]:
     # Samples know fewer priors than can be asked for: none is measured twice.
     priors = dict.fromkeys(prior_used(PriorKind(asked), samples=store is None) for asked in args.priors)
@@ -155,7 +129,7 @@ def _rows(
 
 
 def _frames(
-    one: _Set, store: MapStore | None, matcher: AnyMatcher, options: LocalizerOptions, kind: PriorKind, seed: int
+    one: RecordedSet, store: MapStore | None, matcher: AnyMatcher, options: LocalizerOptions, kind: PriorKind, seed: int
 ) -> Iterator[FrameResult]:
     noise = PriorNoise()
     if store is None:

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import os
-import platform
-import shlex
 import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from datetime import date
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -21,6 +17,7 @@ from tqdm import tqdm
 from ortholoc_edge.bench import pack_process, packs
 from ortholoc_edge.bench.replay import PriorKind
 from ortholoc_edge.cli.arguments import positive_int
+from ortholoc_edge.cli.measured import table_head
 from ortholoc_edge.cli.progress import ProgressBar
 from ortholoc_edge.errors import ConfigError, DatasetError
 from ortholoc_edge.matching.registry import MATCHERS, make_matcher
@@ -141,24 +138,6 @@ def _add_build(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     build.set_defaults(run=_build)
 
 
-def _head(columns: str) -> None:
-    """The line that every table comes with, and its heading."""
-    command = shlex.join(["ortholoc-edge", *sys.argv[1:]])
-    machine = f"{os.cpu_count()} CPUs {_processor()}, {platform.system()}, Python {platform.python_version()}"
-    print(f"`{command}`, {date.today().isoformat()}, {machine}\n")
-    print(columns)
-    print("|" + "---|" * (columns.count("|") - 1), flush=True)
-
-
-def _processor() -> str:
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.is_file():
-        for line in cpuinfo.read_text().splitlines():
-            if line.startswith("model name"):
-                return f'"{line.split(":", 1)[1].strip()}"'
-    return platform.machine()
-
-
 # --- size ---
 
 
@@ -167,7 +146,7 @@ def _size(args: argparse.Namespace) -> int:
     with ProgressBar(f"model {args.matcher}") as bar:
         matcher = make_matcher(args.matcher, working_px=640, max_keypoints=4096, threads=1, progress=bar.step)
     found: dict[str, list[packs.Measured]] = {}
-    _head(
+    table_head(
         "| set | pack | MB/km² | of it DOP / DSM / features | beside MB | frames | recall 1m-1° | TE median m "
         "| RE median ° | TE against lossless | per frame |"
     )
@@ -214,7 +193,7 @@ def _change(ratio: float) -> str:
 
 
 def _memory(args: argparse.Namespace) -> int:
-    _head(
+    table_head(
         "| pack | km² | compressed MB | imports / + model / + pack MB | RSS median / peak MB | peak - compressed MB "
         "| frames, fixed | CPU ms median |"
     )
@@ -268,7 +247,7 @@ def _print_memory(name: str, run: pack_process.MemoryRun) -> None:
 
 
 def _reads(args: argparse.Namespace) -> int:
-    _head("| level | GSD m | windows | cold median / p99 ms | warm median / p99 ms |")
+    table_head("| level | GSD m | windows | cold median / p99 ms | warm median / p99 ms |")
     for row in packs.measure_reads(Pack.open(args.pack), windows=args.windows, seed=args.seed):
         print(
             f"| {row.level} | {row.gsd_m:.2f} | {row.windows} | {row.cold_median_ms:.1f} / {row.cold_p99_ms:.1f} | "
@@ -283,7 +262,7 @@ def _reads(args: argparse.Namespace) -> int:
 
 def _build(args: argparse.Namespace) -> int:
     options = PackOptions(vertical="unknown", source_crs=args.crs, quality=args.quality, features=args.features)
-    _head("| workers | km² | wall s | km²/min | km²/min per core | against one process | pack MB |")
+    table_head("| workers | km² | wall s | km²/min | km²/min per core | against one process | pack MB |")
     first: float | None = None
     with tempfile.TemporaryDirectory(prefix="ortholoc-bench-", dir=args.scratch) as scratch:
         if not args.no_warm_up:
