@@ -118,8 +118,8 @@ def correlate(
     Args:
         template, searched: (2, H, W) float32, of one shape.
         radius: largest shift along each axis, px.
-        cell: side of a cell, px; ``patch_cells`` of them side by side make a patch, and ``stride`` is how many lie between
-            the patches' first cells.
+        cell: side of a cell, px; ``patch_cells`` of them side by side make a patch, and patches begin at every
+            ``stride``-th cell.
         origin: (x, y), added to the shifts that are tried.
     """
     rows, columns = template.shape[1] // cell, template.shape[2] // cell

@@ -101,14 +101,22 @@ class _MapScene:
 class Localizer:
     """Camera, map and matcher, put to work on one frame at a time by one thread."""
 
-    def __init__(self, camera: Camera, store: MapStore, matcher: AnyMatcher, options: LocalizerOptions) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        store: MapStore,
+        matcher: AnyMatcher,
+        options: LocalizerOptions,
+        tuning: structural.Tuning = structural.TUNING,
+    ) -> None:
         self.camera = camera
         self._acquire = matcher.acquire if isinstance(matcher, Structural) else matcher
-        self._tracking = structural.QueryMaker(camera) if isinstance(matcher, Structural) else None
+        self._tracking = structural.QueryMaker(camera, tuning) if isinstance(matcher, Structural) else None
+        self._tuning = tuning
         self._store = store
         self._options = options
         self._max_error_px = pnp.threshold_px(camera)
-        working_px = structural.TUNING.levels[-1].long_px if self._acquire is None else self._acquire.working_px
+        working_px = tuning.levels[-1].long_px if self._acquire is None else self._acquire.working_px
         scale = min(1.0, working_px / max(camera.width, camera.height))
         # The size at which the matcher sees the frame; views of the map are drawn at the same size.
         self._working = camera.pinhole().resized(
@@ -187,7 +195,7 @@ class Localizer:
                 refused = RejectedError(Reason.NO_PRIOR, "structural matching needs a predicted pose")
             else:
                 try:
-                    return self._by_structure(self._tracking, frame, grey, prior, trace)
+                    return self._by_structure(self._tracking, frame, grey, prior, proceed, trace)
                 except RejectedError as error:
                     refused = error
             if self._acquire is None or not proceed():
@@ -203,7 +211,13 @@ class Localizer:
         return self._by_network(frame, grey, prior, proceed, trace)
 
     def _by_structure(
-        self, tracking: structural.QueryMaker, frame: Frame, grey: ImageArray, prior: PosePrior, trace: Trace
+        self,
+        tracking: structural.QueryMaker,
+        frame: Frame,
+        grey: ImageArray,
+        prior: PosePrior,
+        proceed: Callable[[], bool],
+        trace: Trace,
     ) -> Fix:
         """The fix without local features."""
         query = self._worker.submit(self._query_fields, tracking, grey, trace)
@@ -216,7 +230,7 @@ class Localizer:
                 terrain = Terrain.of(window, precondition.grey_map(window), local)
             if terrain is None:
                 raise RejectedError(Reason.MAP_NODATA, "the surface model has no data under the predicted view")
-            found = structural.Tracking(query.result(), terrain, prior, self.camera, trace).run()
+            found = structural.Tracking(query.result(), terrain, prior, self.camera, trace, self._tuning).run(proceed)
         finally:
             query.cancel()
         if found is None:

@@ -55,8 +55,8 @@ class Fix:
         focal_sigma_px: 1-sigma of a calibrated focal length; None if it was given.
         covariance: (6, 6); position in map axes (m), then rotation vector in map axes (rad):
             ``R_true = exp(d) @ R_estimated``.
-        quality: 0..1, the inlier ratio of a round whose pairs were not picked by a pose, of structural matching the part
-            of the patches in view that agree; for displays and for MAVLink's quality field.
+        quality: 0..1, the inlier ratio of a round whose pairs were not picked by a pose; of structural matching the
+            part of the patches in view that agree. For displays and for MAVLink's quality field.
         matches, inliers: counts of the round that gave the pose.
         rms_px: root mean square reprojection error of the inliers at the frame's full size.
         adhop_accepted: whether the second round gave the pose; None if it was not run.

@@ -9,6 +9,7 @@ among turns, scales and shifts that the prior allows.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -45,6 +46,7 @@ class Tuning:
     """What docs/studies/structural.md settled, to be varied there.
 
     ``render_again``: the map is drawn anew at each level, at the pose so far.
+    ``repeat_below``: part of a middle level's matches that agree, below which it is gone through again.
     ``attitude``: the prior's attitude takes part in the pose that goes out.
     ``match_covariance``: a patch counts by how sharp its peak is, and not as all others.
     ``sigma_px``: standard deviation of a patch's place, px of the level, before that of its peak.
@@ -54,6 +56,7 @@ class Tuning:
 
     levels: tuple[Level, ...] = (Level(128, 6, 8, 6), Level(256, 3, 8, 6, 2), Level(512, 2, 16, 3))
     render_again: bool = True
+    repeat_below: float = 0.9
     attitude: bool = True
     match_covariance: bool = True
     sigma_px: float = 0.2
@@ -84,6 +87,8 @@ _MIN_REACH, _MAX_REACH = 0.08, 0.45
 _CONVINCING_MATCHES = 60
 _CONVINCING_SUPPORT = 0.35
 _CONVINCING_BEFORE = 0.5
+# Share of a level's matches, below which going on is a waste: chance alone gives the second level a tenth.
+_HOPELESS = 0.2
 # A search turns the view by steps, within so many sigmas of the heading, and follows so many of the best peaks.
 _SEARCH_SIGMAS = 2.5
 _TURN_STEP_RAD = math.radians(7.0)
@@ -222,12 +227,18 @@ class Tracking:
             upright[3:, 3:] = np.linalg.inv(covariance[3:, 3:])
         self._upright = PoseMeasurement(predicted, upright)
 
-    def run(self) -> Track | None:
-        """The first track that convinces, else the one with the most inliers; None if there is none."""
+    def run(self, proceed: Callable[[], bool] = lambda: True) -> Track | None:
+        """The first track that convinces, else the one with the most inliers; None if there is none.
+
+        Args:
+            proceed: asked before the search and each of its starts; False ends it.
+        """
         best = self._descend(self._predicted.local_from_camera, first=0)
         if best is not None and best.convincing:
             return best
-        for start in self._search():
+        for start in self._search() if proceed() else []:
+            if not proceed():
+                break
             found = self._descend(start, first=1)
             if found is not None and (best is None or found.inliers > best.inliers):
                 best = found
@@ -245,10 +256,19 @@ class Tracking:
             step = self._level(number, drawn_at, pose, known)
             if step is None:
                 return None
-            steps.append(step)
             pose = step.adjusted.local_from_camera
             if self._tuning.render_again:
                 drawn_at = pose
+            if 0 < number < last and step.agreeing < self._tuning.repeat_below:
+                step = self._level(number, drawn_at, pose, known)
+                if step is None:
+                    return None
+                pose = step.adjusted.local_from_camera
+                if self._tuning.render_again:
+                    drawn_at = pose
+            if number > 0 and step.agreeing < _HOPELESS:
+                return None
+            steps.append(step)
         return self._track(steps)
 
     def _level(self, number: int, drawn_at: Rigid3, pose: Rigid3, known: PoseMeasurement) -> _Step | None:
@@ -305,7 +325,7 @@ class Tracking:
             rise = (strength[:, None] * slope).ravel() @ jacobian.reshape(-1, 6)
             normal += known.information
             try:
-                change = np.linalg.solve(normal, rise - known.information @ known.error(pose))
+                change = np.asarray(np.linalg.solve(normal, rise - known.information @ known.error(pose)), np.float64)
             except np.linalg.LinAlgError:
                 return step
             if not np.isfinite(change).all():
