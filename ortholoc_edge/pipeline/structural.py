@@ -89,12 +89,15 @@ _CONVINCING_SUPPORT = 0.35
 _CONVINCING_BEFORE = 0.5
 # Share of a level's matches, below which going on is a waste: chance alone gives the second level a tenth.
 _HOPELESS = 0.2
-# A search turns the view by steps, within so many sigmas of the heading, and follows so many of the best peaks.
+# A search turns the view by steps of so many sigmas, within so many sigmas of the heading, and follows so many of the
+# best peaks. What the prior makes improbable costs a peak so many of its standard deviations per squared sigma.
 _SEARCH_SIGMAS = 2.5
-_TURN_STEP_RAD = math.radians(7.0)
+_TURN_SIGMAS = 1.7
+_MIN_TURN_RAD, _MAX_TURN_RAD = math.radians(3.0), math.radians(7.0)
 _MAX_TURNS = 9
-_PEAKS_PER_TURN = 2
-_CANDIDATES = 4
+_PEAKS_PER_TURN = 3
+_IMPROBABLE = 0.2
+_CANDIDATES = 6
 # Of the last level's patches: independent samples (48 x 48 px, correlated over 3, shared with neighbours), and the
 # highest correlation that counts.
 _SAMPLES = 80.0
@@ -467,23 +470,31 @@ class Tracking:
 
     def _search(self) -> list[Rigid3]:
         """Poses to start level 1 from, the most promising first: peaks of the whole view's correlation there, over
-        turns of the heading."""
+        turns of the heading, less what makes them improbable."""
         camera, field = self._query.cameras[1], self._query.fields[1]
-        predicted, sigma = self._predicted.local_from_camera, self._prior.heading_sigma_rad
-        steps = min(math.ceil(_SEARCH_SIGMAS * sigma / _TURN_STEP_RAD), _MAX_TURNS // 2)
+        predicted = self._predicted.local_from_camera
         candidates: list[tuple[float, Rigid3]] = []
         with self._trace.stage("search"):
-            for turn in range(-steps, steps + 1):
-                turned = rotation.exp([0.0, 0.0, turn * _TURN_STEP_RAD]) @ predicted.rotation
+            for turn_rad in _turns(self._prior.heading_sigma_rad):
+                turned = rotation.exp([0.0, 0.0, turn_rad]) @ predicted.rotation
                 view = render(self._terrain, camera, Rigid3(turned, predicted.translation))
                 if view.valid.mean() < _MIN_VALID:
                     continue
                 template = orientation_field(view.image, view.valid)
                 middle = _middle_px(template)
                 for x, y, peak in structural.whole_shift(template, field, self._reach_px(view), _PEAKS_PER_TURN):
-                    candidates.append((peak, _moved_sideways(view, middle, np.array([x, y], dtype=np.float64))))
+                    pose = _moved_sideways(view, middle, np.array([x, y], dtype=np.float64))
+                    error = self._predicted.error(pose)
+                    candidates.append((peak - _IMPROBABLE * float(error @ self._predicted.information @ error), pose))
         candidates.sort(key=lambda pair: -pair[0])
         return [pose for _, pose in candidates[:_CANDIDATES]]
+
+
+def _turns(sigma_rad: float) -> list[float]:
+    """Turns of the heading that cover what a prior allows, rad."""
+    step = min(max(_TURN_SIGMAS * sigma_rad, _MIN_TURN_RAD), _MAX_TURN_RAD)
+    count = min(math.ceil(_SEARCH_SIGMAS * sigma_rad / step - 0.5), _MAX_TURNS // 2)
+    return [step * k for k in range(-count, count + 1)]
 
 
 def _absorbed_error_factor(scores: FloatArray) -> float:
