@@ -33,10 +33,19 @@ def ranked(takes: Sequence[Take]) -> list[Take]:
 
 
 def best_median_worst(takes: Sequence[Take], count: int) -> dict[str, list[Take]]:
-    """``count`` of each, or all if there are fewer; the worst comes first of the worst."""
+    """``count`` of each, or all if there are fewer, and of each frame one take only; the most extreme come first."""
     order = ranked(takes)
-    middle = max((len(order) - count) // 2, 0)
-    return {"best": order[:count], "median": order[middle : middle + count], "worst": order[::-1][:count]}
+    middle = (len(order) - 1) / 2
+    outward = sorted(range(len(order)), key=lambda rank: abs(rank - middle))
+    chosen = {"best": order, "median": [order[rank] for rank in outward], "worst": order[::-1]}
+    return {which: _first_of_each_frame(those)[:count] for which, those in chosen.items()}
+
+
+def _first_of_each_frame(takes: Sequence[Take]) -> list[Take]:
+    found: dict[int, Take] = {}
+    for take in takes:
+        found.setdefault(id(take.view), take)
+    return list(found.values())
 
 
 def sheet(takes: Sequence[Take]) -> ImageArray:
