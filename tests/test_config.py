@@ -11,6 +11,8 @@ import pytest
 from ortholoc_edge.adapters.bus import Bus, BusOptions
 from ortholoc_edge.config import read_config, read_intrinsics
 from ortholoc_edge.errors import ConfigError, LinkError
+from ortholoc_edge.matching.registry import make_method
+from ortholoc_edge.matching.types import Structural
 from ortholoc_edge.pipeline.outcome import Reason, Rejected
 
 EXAMPLE = (Path(__file__).resolve().parents[1] / "config" / "example.toml").read_text(encoding="utf-8")
@@ -71,6 +73,9 @@ def test_refused_with_file_and_key(old: str, new: str, named: str, tmp_path: Pat
         [],
         [("# width_px = 1280", "width_px = 1280"), ("# height_px = 720", "height_px = 720")],
         [('name = "xfeat"', 'name = "sift"'), ("working_px = 640", "working_px = 650")],
+        [('name = "xfeat"', 'name = "structural"'), ("working_px = 640", "working_px = 650")],
+        [('name = "xfeat"', 'name = "structural+sift"'), ("working_px = 640", "working_px = 650")],
+        [('name = "xfeat"', 'name = "structural+xfeat"')],
         [('folder = "/var/log/ortholoc-edge"', "")],
         [('preset = "nadir-nose-up"', 'preset = "forward"'), ("pitch_deg = 0.0", "pitch_deg = -60")],
     ],
@@ -79,6 +84,25 @@ def test_accepted(changes: list[tuple[str, str]], tmp_path: Path) -> None:
     config = read_config(write(tmp_path, *changes))
     assert config.intrinsics.camera().width == 1280
     assert config.mount.body_from_camera().translation.tolist() == [0.0, 0.0, 0.0]
+
+
+def test_the_second_matcher_s_numbers_are_checked_too(tmp_path: Path) -> None:
+    path = write(tmp_path, ('name = "xfeat"', 'name = "structural+xfeat"'), ("working_px = 640", "working_px = 650"))
+    with pytest.raises(ConfigError, match=r"no multiple of 32.*640 or 672.*\$\.matcher"):
+        read_config(path)
+
+
+def test_without_a_matcher_it_is_structural(tmp_path: Path) -> None:
+    """Which needs no model, so that a drone without network flies."""
+    before, rest = EXAMPLE.split("[matcher]\n")
+    path = tmp_path / "drone.toml"
+    path.write_text(before + rest[rest.index("[localizer]") :], encoding="utf-8")
+    options = read_config(path).matcher
+    assert options.name == "structural"
+    made = make_method(
+        options.name, working_px=options.working_px, max_keypoints=options.max_keypoints, threads=options.threads
+    )
+    assert isinstance(made, Structural)
 
 
 @pytest.mark.parametrize("content", [b"\xff\xfe", b"[camera", b""])

@@ -13,7 +13,9 @@ import pytest
 from ortholoc_edge.cli import models as cli
 from ortholoc_edge.errors import ConfigError, ModelError
 from ortholoc_edge.matching import models
-from ortholoc_edge.matching.registry import make_matcher
+from ortholoc_edge.matching.registry import METHODS, make_matcher, make_method
+from ortholoc_edge.matching.sift import SiftMatcher
+from ortholoc_edge.matching.types import Structural
 from ortholoc_edge.matching.xfeat import XFeatMatcher
 
 
@@ -205,6 +207,34 @@ def test_names_and_numbers_of_matchers_are_checked(tmp_path: Path, filled: Path)
         make_matcher("sift", working_px=512, max_keypoints=2048, threads=1, model_path=tmp_path / "x.onnx")
     with pytest.raises(ConfigError, match="without the model's file"):
         make_matcher("xfeat", working_px=512, max_keypoints=2048, threads=1, model_sha256="0" * 64)
+
+
+def test_methods_are_matchers_and_structural_matching_with_and_without_one(tmp_path: Path) -> None:
+    numbers = {"working_px": 512, "max_keypoints": 2048, "threads": 1}
+    assert METHODS == (
+        "structural", "structural+xfeat", "structural+xfeat-star", "structural+xfeat-lighterglue", "structural+sift",
+        "xfeat", "xfeat-star", "xfeat-lighterglue", "sift",
+    )  # fmt: skip
+    alone = make_method("structural", **numbers)
+    assert isinstance(alone, Structural)
+    assert (alone.name, alone.acquire, alone.model_sha256) == ("structural", None, None)
+    both = make_method("structural+sift", **numbers)
+    assert isinstance(both, Structural)
+    assert isinstance(both.acquire, SiftMatcher)
+    assert (both.name, both.model_sha256, both.acquire.working_px) == ("structural+sift", None, 512)
+    assert isinstance(make_method("sift", **numbers), SiftMatcher)
+    for name in ("surf", "structural+", "structural+surf", "structural+structural", "sift+structural", "+sift", ""):
+        with pytest.raises(ConfigError, match=r"is not known; known are: structural, structural\+xfeat"):
+            make_method(name, **numbers)
+    # Of the matcher of features every argument is checked as ever.
+    with pytest.raises(ConfigError, match="'structural' uses no model"):
+        make_method("structural", **numbers, model_path=tmp_path / "x.onnx")
+    with pytest.raises(ConfigError, match="'structural' uses no model"):
+        make_method("structural", **numbers, model_sha256="0" * 64)
+    with pytest.raises(ConfigError, match="'sift' uses no model"):
+        make_method("structural+sift", **numbers, model_path=tmp_path / "x.onnx")
+    with pytest.raises(ConfigError, match="multiple of 32"):
+        make_method("structural+xfeat", **(numbers | {"working_px": 500}))
 
 
 def _run(*words: str) -> int:
