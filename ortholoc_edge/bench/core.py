@@ -125,13 +125,21 @@ class Take:
     """One frame, localized once.
 
     Attributes:
+        draw: number of the prior; in tracking the seed.
         is_first: of its run: it paid for what is set up once, and its times don't count.
     """
 
     scene: Scene
     view: View
     result: FrameResult
+    draw: int
     is_first: bool
+
+    @property
+    def is_missed(self) -> bool:
+        """Without a fix within 1m-1°."""
+        error, (metres, degrees) = self.result.error, RECALL_LIMITS["1m_1deg"]
+        return error is None or error.te_m > metres or error.re_deg > degrees
 
     @property
     def is_false(self) -> bool:
@@ -232,7 +240,7 @@ def track(scene: Scene, matcher: AnyMatcher, seeds: int) -> Iterator[Take]:
     for seed in range(seeds):
         flown = run_flight(frames, scene.store, matcher, LocalizerOptions(), PriorKind.ODOMETER, PriorNoise(), seed)
         for index, (view, result) in enumerate(zip(scene.views, flown, strict=True)):
-            yield Take(scene, view, result, is_first=index == 0)
+            yield Take(scene, view, result, seed, is_first=index == 0)
 
 
 def random_priors(scene: Scene, matcher: AnyMatcher, draws: int, seed: int) -> Iterator[Take]:
@@ -241,7 +249,7 @@ def random_priors(scene: Scene, matcher: AnyMatcher, draws: int, seed: int) -> I
         for draw in range(draws):
             for index, view in enumerate(scene.views):
                 prior = drawn_prior(scene, index, draw, seed)
-                yield localized(scene, view, localizer_for(view.frame.camera), prior, is_first=draw == index == 0)
+                yield localized(scene, view, localizer_for(view.frame.camera), prior, draw, is_first=draw == index == 0)
 
 
 def beside_the_paper(
@@ -256,8 +264,8 @@ def beside_the_paper(
             region = RegionPrior(view.region or _region(scene, index, seed))
             camera, first = view.frame.camera, index == 0
             yield (
-                [localized(scene, view, paper_for(camera), region, is_first=first) for paper_for in papers],
-                localized(scene, view, localizer_for(camera), drawn_prior(scene, index, 0, seed), is_first=first),
+                [localized(scene, view, paper_for(camera), region, 0, is_first=first) for paper_for in papers],
+                localized(scene, view, localizer_for(camera), drawn_prior(scene, index, 0, seed), 0, is_first=first),
             )
 
 
@@ -274,7 +282,7 @@ def generator(site: Site, *numbers: int) -> np.random.Generator:
 
 
 def localized(
-    scene: Scene, view: View, localizer: Localizer, prior: PosePrior | RegionPrior, *, is_first: bool
+    scene: Scene, view: View, localizer: Localizer, prior: PosePrior | RegionPrior, draw: int, *, is_first: bool
 ) -> Take:
     """One frame from one prior, timed."""
     frame, truth = view.frame, view.frame.map_from_camera
@@ -289,6 +297,7 @@ def localized(
         FrameResult(
             frame.name, frame.stamp_ns, frame.picture, frame.camera, truth, predicted, outcome, error, *spent_ms
         ),
+        draw,
         is_first,
     )
 

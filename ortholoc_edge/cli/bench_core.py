@@ -158,6 +158,7 @@ def _sites(args: argparse.Namespace, scratch: Path) -> tuple[list[core.Site], li
 
 def _tracking(bench: _Bench) -> None:
     bench.report.section("Tracking", f"Flights by odometer prior, {bench.args.seeds} seeds.", FIGURES)
+    measured: list[core.Take] = []
     flights = [scene for scene in bench.scenes if scene.site.is_flight]
     for method in bench.methods:
         every: list[core.Take] = []
@@ -166,6 +167,8 @@ def _tracking(bench: _Bench) -> None:
             every += takes
             bench.report.figures(core.figures("tracking", scene.site.name, method.name, takes))
         bench.report.figures(core.figures("tracking", "all", method.name, every), is_judged=True)
+        measured += every
+    bench.report.missed(measured)
     bench.report.targets()
 
 
@@ -173,30 +176,36 @@ def _random(bench: _Bench) -> None:
     frames = sum(len(scene.views) for scene in bench.scenes)
     draws = -(-bench.args.draws // frames)
     bench.report.section("Random priors", f"{draws} of each of {frames} frames.", FIGURES)
+    measured: list[core.Take] = []
     for method in bench.methods:
         found = _by_set(bench.scenes, method, draws, bench.args.seed)
         every = [take for takes in found.values() for take in takes]
         for name, takes in found.items():
             bench.report.figures(core.figures("random", name, method.name, takes))
         bench.report.figures(core.figures("random", "all", method.name, every), is_judged=True)
+        measured += every
         if bench.args.out is not None:
             for which, chosen in contact.best_median_worst(every, _SHOWN).items():
                 draw.write_png(bench.args.out / f"{method.name}_{which}.png", contact.sheet(chosen))
+    bench.report.missed(measured)
     bench.report.targets()
 
 
 def _crossdomain(bench: _Bench) -> None:
     draws = bench.args.crossdomain_draws
+    measured: list[core.Take] = []
     bench.report.section("Across domains", f"Random priors, {draws} of each photo.", FIGURES)
     for method in bench.methods:
         for name, takes in _by_set(bench.other_scenes, method, draws, bench.args.seed).items():
             bench.report.figures(core.figures("crossdomain", name, method.name, takes), is_judged=True)
+            measured += takes
             lasting = core.lasting(takes)
             if lasting:
                 bench.report.figures(
                     core.figures("crossdomain", f"{name} with something lasting in view", method.name, lasting),
                     is_judged=True,
                 )
+    bench.report.missed(measured)
     bench.report.targets()
 
 

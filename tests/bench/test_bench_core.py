@@ -112,8 +112,11 @@ def test_an_estimator_twice_as_wrong_as_it_says_has_four_times_the_nees(
 
 def test_figures_count_all_frames_in_recall_and_fixes_in_errors(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     sideways = Estimator(np.array([0.0, 0.7, 0.0, 0.0, 0.0, 0.0]), 0.5, refused=("frame_01",))
-    found = core.figures("random", "x", "m", takes_by(scene, sideways, monkeypatch))
+    takes = takes_by(scene, sideways, monkeypatch)
+    found = core.figures("random", "x", "m", takes)
     assert (found.frames, found.fixes, found.rejected) == (6, 4, {"few_matches": 2})
+    assert [take.is_missed for take in takes] == [False, True, False] * 2
+    assert [take.draw for take in takes] == [0] * 3 + [1] * 3
     assert found.recall == {"1m_1deg": pytest.approx(2 / 3), "0.5m_0.5deg": 0.0}
     assert found.te_m.median == found.te_m.max == pytest.approx(0.7)
     assert found.query_px == 480
@@ -389,6 +392,22 @@ def test_a_false_fix_is_listed_with_its_number_and_can_be_run_alone(
         "hostile frames": False,
         "false fixes": False,
     }
+
+
+def test_missed_frames_are_named_with_their_prior(
+    data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    estimator = Estimator(np.array([2.0, 0, 0, 0, 0, 0]), 1.0, refused=("frame_01",))
+    monkeypatch.setattr(core, "localizers", lambda store, matcher, options: instead(estimator))
+    asked = ["bench-core", data, "--sets", "here", "--parts", "random", "--draws", 3]
+    assert run(*asked) == 0
+    assert (
+        "Beyond 1m-1° (3): here/frame_00 #0 2.00 m 0.00°, here/frame_01 #0 few_matches, here/frame_02 #0 2.00 m 0.00°."
+        in capsys.readouterr().out
+    )
+    assert run(*asked, "--json") == 0
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [(r["name"], r["draw"]) for r in rows if r["row"] == "missed"] == [(f"frame_0{k}", 0) for k in range(3)]
 
 
 def test_what_can_not_be_measured_is_said_first(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
