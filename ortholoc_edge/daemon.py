@@ -45,7 +45,7 @@ from ortholoc_edge.geometry import frames
 from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.matching.registry import make_method
-from ortholoc_edge.matching.types import AnyMatcher
+from ortholoc_edge.matching.types import STRUCTURAL, AnyMatcher
 from ortholoc_edge.pipeline.frame import Frame, VehicleState
 from ortholoc_edge.pipeline.localizer import Localizer
 from ortholoc_edge.pipeline.navigator import Navigator
@@ -137,7 +137,7 @@ class Daemon:
                     Pack.open(Path(config.map.pack), public_key),
                     cache_bytes=config.map.cache_mb * 2**20,
                     memory_bytes=config.map.memory_mb * 2**20,
-                    features=config.localizer.precomputed_features != "never",
+                    features=config.localizer.precomputed_features != "never" and config.matcher.name != STRUCTURAL,
                     require_intact=config.map.require_intact,
                 )
             )

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import cv2
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, structs
 
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import FloatArray
@@ -34,8 +34,11 @@ class GateOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     min_inliers: Annotated[int, Meta(ge=6)] = 30
     min_inlier_ratio: Annotated[float, Meta(ge=0, le=1)] = 0.20
     # Of structural matching: part of the patches in view that agree with the pose. Right poses on the real flights have
-    # 0.45 or more, wrong ones in rows of trees up to 0.14 (docs/studies/structural.md).
-    min_support: Annotated[float, Meta(ge=0, le=1)] = 0.15
+    # 0.45 or more; in another season 0.05 or more. Frames of another place have up to 0.03, one tree's row taken for the
+    # next up to 0.14: below the second limit the pose must be where it was expected, within so many sigmas.
+    min_support: Annotated[float, Meta(ge=0, le=1)] = 0.07
+    sure_support: Annotated[float, Meta(ge=0, le=1)] = 0.15
+    unsure_innovation_sigmas: Annotated[float, Meta(gt=0)] = 3.0
     # Convex hull of the inliers over the image's area.
     min_spread: Annotated[float, Meta(ge=0, le=1)] = 0.12
     # Root mean square of the inliers over the inlier threshold; uniform outliers give 0.71.
@@ -99,8 +102,26 @@ def enough_inliers(estimate: PoseEstimate, options: GateOptions) -> Refusal | No
 def well_supported(support: float, options: GateOptions) -> Refusal | None:
     """Chance, and a pattern that repeats, give some patches a place; the right pose gives it to most of them."""
     if support < options.min_support:
-        return Refusal(Reason.LOW_INLIER_RATIO, "of the patches in view agree", support, options.min_support)
+        return Refusal(Reason.LOW_INLIER_RATIO, "part of the patches in view that agree", support, options.min_support)
     return None
+
+
+def lenient(options: GateOptions, part: float) -> GateOptions:
+    """The limits with only a part of the least number and ratio of inliers."""
+    return structs.replace(
+        options,
+        min_inliers=max(6, round(part * options.min_inliers)),
+        min_inlier_ratio=part * options.min_inlier_ratio,
+    )
+
+
+def for_support(support: float, options: GateOptions) -> GateOptions:
+    """The limits for a pose with so much support."""
+    if support >= options.sure_support:
+        return options
+    return structs.replace(
+        options, max_innovation_sigmas=min(options.max_innovation_sigmas, options.unsure_innovation_sigmas)
+    )
 
 
 def well_spread(estimate: PoseEstimate, query_px: FloatArray, options: GateOptions) -> Refusal | None:

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 import cv2
 import numpy as np
-from msgspec import Meta, Struct, field, structs
+from msgspec import Meta, Struct, field
 
 from ortholoc_edge.errors import MapError
 from ortholoc_edge.geometry import homography
@@ -242,7 +242,8 @@ class Localizer:
             solved = Solved(
                 found.query_px, local.map_from_local(found.points_local), found.estimate, len(found.query_px)
             )
-            fix = self._fix(frame, solved, Scene(window, local, ground_m), prior)
+            limits = gate.for_support(found.support, self._options.gate)
+            fix = self._fix(frame, solved, Scene(window, local, ground_m), prior, limits)
         return replace(fix, quality=found.support, timings_ms=trace.timings_ms())
 
     def _query_fields(self, tracking: structural.QueryMaker, grey: ImageArray, trace: Trace) -> structural.QueryFields:
@@ -303,18 +304,18 @@ class Localizer:
     ) -> Fix:
         """The fix without the network on the map. A round must pass the gate before pairs are looked for around its
         pose, since those will agree with it."""
+        limits = self._options.gate
         first = self._first_attempt(stored, grey, prior, proceed, trace)
         again = before = None
         if self._options.adhop:
             try:
-                before = self._fix(frame, first.found.solved, first.scene, prior, _BEFORE_LOOKING_AGAIN)
+                before = self._fix(frame, first.found.solved, first.scene, prior, gate.lenient(limits, _BEFORE_LOOKING_AGAIN))
             except RejectedError:
                 first = stored.rectified_again(grey, first, self._homography_threshold_px, trace)
-                before = self._fix(frame, first.found.solved, first.scene, prior, _BEFORE_LOOKING_AGAIN)
+                before = self._fix(frame, first.found.solved, first.scene, prior, gate.lenient(limits, _BEFORE_LOOKING_AGAIN))
             again = stored.looked_again(first, trace)
         with trace.stage("gate"):
             fix = self._fix(frame, (again or first.found).solved, first.scene, prior)
-            limits = self._options.gate
             if before is not None and (before.inliers < limits.min_inliers or before.quality < limits.min_inlier_ratio):
                 needed = _AFTER_LOOKING_AGAIN * limits.min_inliers
                 if fix.inliers < needed:
@@ -601,11 +602,16 @@ class Localizer:
     # -- judgement -------------------------------------------------------------------------------------
 
     def _fix(
-        self, frame: Frame, chosen: Solved, scene: Scene, prior: PosePrior | RegionPrior, inliers_needed: float = 1.0
+        self,
+        frame: Frame,
+        chosen: Solved,
+        scene: Scene,
+        prior: PosePrior | RegionPrior,
+        limits: gate.GateOptions | None = None,
     ) -> Fix:
         """
         Args:
-            inliers_needed: part of the gate's least number and ratio of inliers that is enough.
+            limits: of the gate; None: as configured.
         """
         estimate = chosen.estimate
         if len(chosen.query_px) < _MIN_MATCHES:
@@ -630,7 +636,6 @@ class Localizer:
         covariance = estimate.covariance + self._map_covariance
         below = float(self._store.heights(pose.translation[None, :2])[0])
         height_m = float(pose.translation[2]) - (below if math.isfinite(below) else scene.ground_m)
-        limits = self._options.gate
         refusal = gate.check(
             estimate,
             chosen.query_px,
@@ -639,11 +644,7 @@ class Localizer:
             height_m,
             prior if isinstance(prior, PosePrior) else None,
             self._max_error_px,
-            structs.replace(
-                limits,
-                min_inliers=max(6, round(inliers_needed * limits.min_inliers)),
-                min_inlier_ratio=inliers_needed * limits.min_inlier_ratio,
-            ),
+            limits or self._options.gate,
         )
         if refusal is not None:
             raise RejectedError(refusal.reason, refusal.detail, refusal.measured, refusal.limit)
