@@ -9,7 +9,7 @@ import pytest
 
 from ortholoc_edge.geometry.arrays import Float32Array, FloatArray
 from ortholoc_edge.matching.orientation import orientation_field
-from ortholoc_edge.matching.structural import Displacements, correlate, whole_shift
+from ortholoc_edge.matching.structural import Correlation, Displacements, correlate, whole_shift
 
 HEIGHT, WIDTH = 96, 128
 CELL, PATCH_CELLS, RADIUS = 8, 4, 4
@@ -246,6 +246,72 @@ def test_taking_some() -> None:
     assert np.array_equal(some.template_px, one.template_px[[5, 2]])
     assert np.array_equal(some.curvature, one.curvature[[5, 2]])
     assert len(one.take(one.score > 2.0)) == 0
+
+
+def test_every_second_patch() -> None:
+    all_of_them, some = found(field(0), field(0, (1.3, -0.4))), found(field(0), field(0, (1.3, -0.4)), stride=2)
+    assert np.unique(np.diff(np.unique(some.template_px[:, 0]))).tolist() == [2 * CELL]
+    for place, shift in zip(some.template_px, some.shift_px, strict=True):
+        (same,) = np.flatnonzero((all_of_them.template_px == place).all(axis=1))
+        assert shift == pytest.approx(all_of_them.shift_px[same], abs=1e-4)
+
+
+# -- scores between the shifts that were tried -------------------------------
+
+
+def correlation(shift: tuple[float, float], origin: tuple[int, int] = (0, 0)) -> Correlation:
+    return correlate(
+        field(0), field(0, shift), radius=RADIUS, cell=CELL, patch_cells=PATCH_CELLS, origin=origin
+    )
+
+
+def test_at_the_peak_the_score_is_highest_and_level() -> None:
+    shift = 1.3, -0.6
+    made = correlation(shift)
+    peaks = made.peaks()
+    index = [int(np.flatnonzero((made.template_px == place).all(axis=1))[0]) for place in peaks.template_px]
+    asked = np.zeros((len(made.template_px), 2))
+    asked[index] = peaks.shift_px
+    score, slope, inside = (values[index] for values in made.at(asked))
+    assert inside.all()
+    assert (score >= peaks.score - 1e-6).all()
+    assert np.abs(slope).max() < 0.01
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0), (0.3, -0.2), (-1.4, 2.1), (2.6, 0.45)])
+def test_slopes_are_those_of_the_scores(place: tuple[float, float]) -> None:
+    made = correlation((0.7, 0.4), (1, -1))
+    asked = np.tile(np.add(place, (1, -1)), (len(made.template_px), 1))
+    score, slope, inside = made.at(asked)
+    assert inside.all()
+    for axis in (0, 1):
+        step = np.zeros(2)
+        step[axis] = 0.02
+        ahead, behind = made.at(asked + step)[0], made.at(asked - step)[0]
+        assert slope[:, axis] == pytest.approx((ahead - behind) / 0.04, abs=1e-4)
+    if place == (0.0, 0.0):
+        assert score == pytest.approx(made.scores[RADIUS, RADIUS], abs=1e-6)
+
+
+@pytest.mark.parametrize("place", [(RADIUS, 0.0), (0.0, -50.0), (np.inf, 0.0), (np.nan, np.nan), (1e9, 1e9)])
+def test_beyond_what_was_tried_is_nothing(place: tuple[float, float]) -> None:
+    made = correlation((0.0, 0.0))
+    score, slope, inside = made.at(np.tile(place, (len(made.template_px), 1)))
+    assert not inside.any()
+    assert not score.any()
+    assert not slope.any()
+
+
+def test_sharpness_is_the_template_s_own_curvature() -> None:
+    made = correlation((0.8, 0.3))
+    assert np.linalg.eigvalsh(made.sharpness).min() > 0
+    itself = found(field(0), field(0))
+    inner = off_rim(itself, (0.0, 0.0))
+    index = [int(np.flatnonzero((made.template_px == place).all(axis=1))[0]) for place in inner.template_px]
+    # Not normalised by the shifted patch's strength, hence the room.
+    assert np.median(made.sharpness[index][:, [0, 1], [0, 1]]) == pytest.approx(
+        np.median(inner.curvature[:, [0, 1], [0, 1]]), rel=0.2
+    )
 
 
 # -- the whole field ---------------------------------------------------------

@@ -498,6 +498,18 @@ def test_its_own_view_is_tracked_to_centimetres(camera: Camera, tilt_deg: float)
     assert len(found.query_px) == len(found.points_local) == len(found.estimate.inliers)
 
 
+def test_matches_are_in_pixels_of_the_full_frame() -> None:
+    """Three times as large as the last level: half a pixel of that would be more than one."""
+    camera = Camera.from_focal(1620, 1080, 1400.0)
+    terrain, truth = painted(), camera_at(tilt_deg=15.0)
+    found = track(terrain, render(terrain, camera, truth).image, predicted(terrain, truth), camera)
+    assert found is not None
+    assert found.estimate.camera == camera
+    seen = camera.project(truth.inverse().apply(found.points_local))
+    off = (seen - found.query_px)[found.estimate.inliers]
+    assert np.abs(np.median(off, axis=0)).max() < 0.25
+
+
 def no_heights_east(window: MapWindow) -> None:
     window.dsm[:, window.dsm.shape[1] // 2 :] = np.nan
 
