@@ -39,7 +39,8 @@ def orientation_field(image: ImageArray, valid: BoolArray | None = None) -> Floa
     """
     x = cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=3)
     y = cv2.Sobel(image, cv2.CV_32F, 0, 1, ksize=3)
-    strength = np.asarray(cv2.magnitude(x, y), dtype=np.float32)
+    # Not cv2.magnitude: it rounds by how its buffers lie in memory, and a replay must give the same bits.
+    strength = np.sqrt(x * x + y * y)
     scale = 1.0 / np.maximum(strength, np.float32(1e-3))
     inner: Float32Array | None = None
     if valid is not None and not valid.all():

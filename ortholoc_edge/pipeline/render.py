@@ -17,7 +17,7 @@ import numpy as np
 
 from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, ImageArray
 from ortholoc_edge.geometry.camera import Camera
-from ortholoc_edge.geometry.grid import RasterGrid
+from ortholoc_edge.geometry.grid import RasterGrid, bilinear
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.prior import MAX_RANGE_HEIGHTS
 from ortholoc_edge.tiles.georeference import LocalFrame
@@ -128,13 +128,8 @@ class RenderedView:
 
     def points_local(self, px: FloatArray) -> FloatArray:
         """Points (N, 3) of the map, local m, that pixels (N, 2) of the view show. They lie on the pixels' rays."""
-        if not len(px):
-            return np.empty((0, 3))
         rays = self.camera.unproject(px) @ self.local_from_camera.rotation.T
-        nodes = _node_px(px)
-        fall = cv2.remap(
-            self.fall_m, nodes[None, :, 0], nodes[None, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )[0].astype(np.float64)
+        fall = bilinear(self.fall_m, _node_px(px))
         return np.asarray(self.local_from_camera.translation + rays * (fall / -rays[:, 2])[:, None], dtype=np.float64)
 
     def is_steep(self, px: FloatArray) -> BoolArray:
@@ -143,9 +138,9 @@ class RenderedView:
         return np.asarray(self.steep[row, column])
 
 
-def _node_px(px: FloatArray) -> Float32Array:
+def _node_px(px: FloatArray) -> FloatArray:
     # The net begins one node outside, with centres as OpenCV's resizing has them.
-    return np.asarray((px - (0.5 * _NODE_PX - 0.5)) / _NODE_PX + 1.0, dtype=np.float32)
+    return (px - (0.5 * _NODE_PX - 0.5)) / _NODE_PX + 1.0
 
 
 def render(terrain: Terrain, camera: Camera, local_from_camera: Rigid3) -> RenderedView:
