@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any, Final
@@ -41,7 +42,8 @@ class Report:
         if self._as_json:
             return
         if not self._is_begun:
-            print(provenance(), end="\n\n")
+            # Wall times, and by the caches CPU times too, are worth little on a busy machine.
+            print(f"{provenance()}, load {os.getloadavg()[0]:.1f} when it began\n")
             self._is_begun = True
         print(f"### {title}\n\n{text}\n")
         print_heading(columns)
