@@ -21,7 +21,8 @@ from ortholoc_edge.bench import metrics, sequence
 from ortholoc_edge.bench.replay import PriorNoise, noisy_prior
 from ortholoc_edge.errors import CameraError, DatasetError, MapError
 from ortholoc_edge.geometry.camera import Camera
-from ortholoc_edge.matching.registry import make_matcher
+from ortholoc_edge.matching.registry import make_method
+from ortholoc_edge.matching.types import STRUCTURAL
 from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.localizer import Localizer, LocalizerOptions
 from ortholoc_edge.pipeline.outcome import Fix
@@ -76,7 +77,7 @@ class LocalizerProcess:
         pack: Path,
         flight: Path,
         *,
-        matcher: str = "xfeat",
+        matcher: str = STRUCTURAL,
         features: bool = False,
         cache_bytes: int = CACHE_BYTES,
     ) -> None:
@@ -123,7 +124,7 @@ def serve() -> None:
     """What `LocalizerProcess` runs: answers a line "photo seed" by the figures of that frame."""
     ask = json.loads(sys.argv[1])
     imported = _memory_mb()[0]
-    matcher = make_matcher(ask["matcher"], working_px=640, max_keypoints=4096, threads=1)
+    matcher = make_method(ask["matcher"], working_px=640, max_keypoints=4096, threads=1)
     recorded = sequence.read_flight(Path(ask["flight"]))
     with_model = _memory_mb()[0]
     pack = Pack.open(Path(ask["pack"]))

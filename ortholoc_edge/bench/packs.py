@@ -23,7 +23,7 @@ from ortholoc_edge.bench.replay import FrameResult, PriorKind, PriorNoise
 from ortholoc_edge.bench.runner import run_flight
 from ortholoc_edge.errors import DatasetError
 from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, ImageArray
-from ortholoc_edge.matching.types import Matcher
+from ortholoc_edge.matching.types import AnyMatcher
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
 from ortholoc_edge.tiles.build import PackOptions, Workers, build_pack
 from ortholoc_edge.tiles.cog import set_block_cache
@@ -196,7 +196,7 @@ def _profile(bands: Any, transform: Affine, step: int, crs: Any) -> dict[str, An
 
 
 def measure_variant(
-    flight: Path, pack: Pack, matcher: Matcher, features: bool, kind: PriorKind, seeds: int, adhop: bool = True
+    flight: Path, pack: Pack, matcher: AnyMatcher, features: bool, kind: PriorKind, seeds: int, adhop: bool = True
 ) -> Measured:
     """Localize a flight on a pack with several seeds of all noise."""
     recorded = sequence.read_flight(flight)

@@ -20,8 +20,10 @@ from ortholoc_edge.cli.arguments import positive_int
 from ortholoc_edge.cli.measured import table_head
 from ortholoc_edge.cli.progress import ProgressBar
 from ortholoc_edge.errors import ConfigError, DatasetError
-from ortholoc_edge.matching.registry import MATCHERS, make_matcher
+from ortholoc_edge.matching.registry import MATCHERS, METHODS, make_method
+from ortholoc_edge.matching.types import STRUCTURAL
 from ortholoc_edge.tiles.build import PackOptions, Workers, build_pack
+from ortholoc_edge.tiles.features import MATCHERS as FEATURE_MATCHERS
 from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.store import CACHE_BYTES
 
@@ -63,9 +65,9 @@ def _add_size(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "--features",
         nargs="*",
         type=float,
-        default=[PackOptions().features_per_mpx],
         metavar="N",
-        help="precomputed per million pixels (default: %(default)s)",
+        help=f"precomputed per million pixels (default: {PackOptions().features_per_mpx:g} for a matcher that packs "
+        "have features for, else none)",
     )
     size.add_argument(
         "--quality",
@@ -73,7 +75,7 @@ def _add_size(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         default=PackOptions().quality,
         help="WEBP of the rows that vary DSM error and features (default: %(default)s)",
     )
-    size.add_argument("--matcher", choices=MATCHERS, default="xfeat", help="(default: %(default)s)")
+    size.add_argument("--matcher", choices=METHODS, default=STRUCTURAL, help="(default: %(default)s)")
     size.add_argument(
         "--prior", choices=[str(k) for k in PriorKind], default=str(PriorKind.ODOMETER), help="(default: %(default)s)"
     )
@@ -95,7 +97,7 @@ def _add_memory(actions: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     memory.add_argument("--small", type=Path, metavar="PACK", help="a pack of a part of the same area")
     memory.add_argument("--small-flight", type=Path, metavar="FLIGHT", help="a flight on both packs (default: FLIGHT)")
     memory.add_argument("--frames", type=positive_int, default=200, help="(default: %(default)s)")
-    memory.add_argument("--matcher", choices=MATCHERS, default="xfeat", help="(default: %(default)s)")
+    memory.add_argument("--matcher", choices=METHODS, default=STRUCTURAL, help="(default: %(default)s)")
     memory.add_argument("--features", action="store_true", help="use the pack's precomputed features")
     memory.add_argument(
         "--cache-mb", type=positive_int, default=CACHE_BYTES // 2**20, help="of decoded blocks (default: %(default)s)"
@@ -142,9 +144,10 @@ def _add_build(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
 
 
 def _size(args: argparse.Namespace) -> int:
-    chosen = packs.variants(args.webp, args.jpeg, args.z_error, args.features, args.matcher, args.quality)
+    features, features_of = _features(args.features, args.matcher)
+    chosen = packs.variants(args.webp, args.jpeg, args.z_error, features, features_of, args.quality)
     with ProgressBar(f"model {args.matcher}") as bar:
-        matcher = make_matcher(args.matcher, working_px=640, max_keypoints=4096, threads=1, progress=bar.step)
+        matcher = make_method(args.matcher, working_px=640, max_keypoints=4096, threads=1, progress=bar.step)
     found: dict[str, list[packs.Measured]] = {}
     table_head(
         "| set | pack | MB/km² | of it DOP / DSM / features | beside MB | frames | recall 1m-1° | TE median m "
@@ -165,6 +168,16 @@ def _size(args: argparse.Namespace) -> int:
         for variant in chosen:
             _print_size("all", packs.size_row(variant.name, found[variant.name], found[chosen[0].name]))
     return 0
+
+
+def _features(asked: list[float] | None, method: str) -> tuple[list[float], str]:
+    """Features per million pixels to measure, and the matcher that they are extracted for."""
+    name = method.removeprefix(f"{STRUCTURAL}+")
+    if name in FEATURE_MATCHERS:
+        return [PackOptions().features_per_mpx] if asked is None else asked, name
+    if asked:
+        raise ConfigError(f"packs have no features for {method}, only for {', '.join(FEATURE_MATCHERS)}; see --matcher")
+    return [], name
 
 
 def _flight(folder: Path) -> tuple[Path, Path, Path]:

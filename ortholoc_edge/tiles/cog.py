@@ -33,7 +33,8 @@ BLOCK_PX = 512
 
 # An open level that was read from holds buffers of its own besides GDAL's cache: 1.0 MB of a DOP, 1.7 MB of a DSM
 # (measured). A view lies in at most 4 tiles of either, mostly in one or two; from 2 km above ground it takes in a
-# dozen of each, and with fewer handles than that every read would open them all again.
+# dozen of each, and with fewer handles than that every read would open them all again. Low above ground `settle` keeps
+# them few.
 MAX_HANDLES = 28
 
 # Of a pixel: what the sums of coordinates of millions of metres may be off.
@@ -73,7 +74,9 @@ class Handles:
     def __init__(self, limit: int = MAX_HANDLES) -> None:
         self.lock = threading.RLock()
         self._limit = limit
-        self._open: OrderedDict[tuple[int, int], Any] = OrderedDict()
+        # By COG and level: the dataset, and the turn it was used in last. Used longest ago first.
+        self._open: OrderedDict[tuple[int, int], tuple[Any, int]] = OrderedDict()
+        self._turn = 0
 
     def __len__(self) -> int:
         return len(self._open)
@@ -81,21 +84,38 @@ class Handles:
     def get(self, cog: Cog, level: int) -> Any:
         """A dataset of one level; to be used under ``lock`` only. Raises: MapError, UndecodableError."""
         key = id(cog), level
-        dataset = self._open.get(key)
-        if dataset is None:
+        if key in self._open:
+            dataset = self._open[key][0]
+        else:
             dataset = cog.open_level(level)
             if len(self._open) >= self._limit:
-                self._open.popitem(last=False)[1].close()
+                self._close_oldest()
                 _give_back()
-            self._open[key] = dataset
+        self._open[key] = dataset, self._turn
         self._open.move_to_end(key)
         return dataset
+
+    def settle(self) -> None:
+        """End a turn, as one frame's reads are: close what neither it nor the one before used.
+
+        Two, since frames in turn may read another level, or just beyond a tile's border.
+        """
+        with self.lock:
+            count = len(self._open)
+            while self._open and next(iter(self._open.values()))[1] < self._turn - 1:
+                self._close_oldest()
+            if len(self._open) < count:
+                _give_back()
+            self._turn += 1
 
     def forget(self, cog: Cog) -> None:
         """Close what is open of a COG."""
         with self.lock:
             for key in [key for key in self._open if key[0] == id(cog)]:
-                self._open.pop(key).close()
+                self._open.pop(key)[0].close()
+
+    def _close_oldest(self) -> None:
+        self._open.popitem(last=False)[1][0].close()
 
 
 class Cog:

@@ -26,7 +26,9 @@ from ortholoc_edge.tiles.window import MapWindow, SurfaceWindow
 
 logger = logging.getLogger(__name__)
 
-CACHE_BYTES = 32 * 2**20
+# The blocks of one view, of DOP and DSM, which the next frame mostly looks at again. 32 MiB cost 19 MB more at the peak
+# and save no CPU time (measured).
+CACHE_BYTES = 12 * 2**20
 # Of compressed files: about 190 km2 at 4 MB per km2.
 MEMORY_BYTES = 768 * 2**20
 
@@ -88,7 +90,7 @@ class MapStore:
                 f" --max-size, or raise map.memory_mb"
             )
         set_block_cache(cache_bytes)
-        handles = Handles()
+        self._handles = handles = Handles()
         self._dop = LoadedLayer(manifest.dop, pack.path, handles, pack.missing, salvage=not pack.signed)
         try:
             self._dsm = LoadedLayer(manifest.dsm, pack.path, handles, pack.missing, salvage=not pack.signed)
@@ -185,6 +187,7 @@ class MapStore:
                 )
         dop, valid = self._dop.read_image(level, window)
         dsm = self._dsm.read_heights(dsm_level, dsm_window)
+        self._handles.settle()
         for array in (dop, valid, dsm):
             array.flags.writeable = False
         return MapWindow(dop, valid, dop_grid, dsm, self._dsm.grids[dsm_level].crop(*dsm_window))

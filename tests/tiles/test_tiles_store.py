@@ -323,6 +323,23 @@ def test_open_handles_are_bounded(pack, monkeypatch):
     assert len(handles) == 0
 
 
+def test_what_two_reads_did_not_use_is_closed_and_can_be_read_again(pack):
+    first, other = (WEST + 10, SOUTH + 10, WEST + 40, SOUTH + 40), (WEST + 150, SOUTH + 120, WEST + 190, SOUTH + 160)
+    with MapStore(pack) as opened:
+        before = opened.read(first, 0.25)
+        # Levels of the tiles under another place are opened, and the first ones kept for a turn.
+        opened.read(other, 2.0)
+        handles = opened._dop._handles
+        count = len(handles)
+        kept = list(handles._open)
+        opened.read(other, 2.0)
+        opened.read(other, 2.0)
+        assert len(handles) < count
+        assert set(handles._open) < set(kept)
+        again = opened.read(first, 0.25)
+        assert same(before.dop, again.dop) and same(before.dsm, again.dsm)
+
+
 def test_bytes_in_memory_are_not_copied_for_gdal():
     def resident():
         return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
