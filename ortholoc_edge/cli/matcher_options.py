@@ -26,7 +26,8 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--working-px",
         type=positive_int,
         default=640,
-        help="long side at which a matcher of features sees images, px; a multiple of 32 for all but sift (default: %(default)s)",
+        help="long side at which a matcher of features sees images, px; a multiple of 32 for all but sift (default: "
+        "%(default)s)",
     )
     group.add_argument(
         "--max-keypoints",

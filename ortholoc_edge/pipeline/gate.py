@@ -33,9 +33,9 @@ class GateOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     min_inliers: Annotated[int, Meta(ge=6)] = 30
     min_inlier_ratio: Annotated[float, Meta(ge=0, le=1)] = 0.20
-    # Of structural matching: part of the patches in view that agree with the pose. Right poses on the real flights have
-    # 0.45 or more; in another season 0.05 or more. Frames of another place have up to 0.03, one tree's row taken for the
-    # next up to 0.14: below the second limit the pose must be where it was expected, within so many sigmas.
+    # Of structural matching: part of the patches in view that agree with the pose. Right poses on the real flights
+    # have 0.45 or more; in another season 0.05 or more. Frames of another place have up to 0.03, one row of trees taken
+    # for the next up to 0.14: below the second limit the pose must be where it was expected, within so many sigmas.
     min_support: Annotated[float, Meta(ge=0, le=1)] = 0.07
     sure_support: Annotated[float, Meta(ge=0, le=1)] = 0.15
     unsure_innovation_sigmas: Annotated[float, Meta(gt=0)] = 3.0

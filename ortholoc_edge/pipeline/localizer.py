@@ -305,14 +305,15 @@ class Localizer:
         """The fix without the network on the map. A round must pass the gate before pairs are looked for around its
         pose, since those will agree with it."""
         limits = self._options.gate
+        lenient = gate.lenient(limits, _BEFORE_LOOKING_AGAIN)
         first = self._first_attempt(stored, grey, prior, proceed, trace)
         again = before = None
         if self._options.adhop:
             try:
-                before = self._fix(frame, first.found.solved, first.scene, prior, gate.lenient(limits, _BEFORE_LOOKING_AGAIN))
+                before = self._fix(frame, first.found.solved, first.scene, prior, lenient)
             except RejectedError:
                 first = stored.rectified_again(grey, first, self._homography_threshold_px, trace)
-                before = self._fix(frame, first.found.solved, first.scene, prior, gate.lenient(limits, _BEFORE_LOOKING_AGAIN))
+                before = self._fix(frame, first.found.solved, first.scene, prior, lenient)
             again = stored.looked_again(first, trace)
         with trace.stage("gate"):
             fix = self._fix(frame, (again or first.found).solved, first.scene, prior)

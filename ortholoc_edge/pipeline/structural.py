@@ -324,7 +324,8 @@ class Tracking:
             score, slope, inside = found.at(np.where(np.isfinite(shift), shift, np.inf))
             score = np.where(inside & shown, np.clip(score, 0.0, _MAX_SCORE), 0.0)
             strength = _SAMPLES * score / (1.0 - score**2)
-            normal, _ = normal_equations(jacobian, (strength * score)[:, None, None] * found.sharpness, shift * 0.0)
+            stiffness = (strength * score)[:, None, None] * found.sharpness
+            normal, _ = normal_equations(jacobian, stiffness, np.zeros_like(shift))
             rise = (strength[:, None] * slope).ravel() @ jacobian.reshape(-1, 6)
             normal += known.information
             try:

@@ -129,8 +129,8 @@ def _geman_mcclure(squared: FloatArray, scale: float) -> FloatArray:
 
 
 def linearised(points: FloatArray, px: FloatArray, camera: Camera, pose: Rigid3) -> tuple[FloatArray, FloatArray]:
-    """Residuals (N, 2) of points (N, 3) seen at ``px`` (N, 2), infinite behind the camera, and their Jacobian (N, 2, 6),
-    0 there, by camera centre and rotation vector (both in map axes, ``R = exp(d) R``)."""
+    """Residuals (N, 2) of points (N, 3) seen at ``px`` (N, 2), infinite behind the camera, and their Jacobian
+    (N, 2, 6), 0 there, by camera centre and rotation vector (both in map axes, ``R = exp(d) R``)."""
     from_centre = points - pose.translation
     x, y, z = (from_centre @ pose.rotation).T
     ahead = z > _MIN_DEPTH_M

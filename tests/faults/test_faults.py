@@ -426,7 +426,8 @@ def test_model_of_another_hash(
     model = tmp_path / "xfeat.onnx"
     model.write_bytes(b"not what was tested")
     arguments = ["localize", flight / "photos" / "frame_00.jpg", "--pack", rendered.store().pack.path,
-                 "--intrinsics", intrinsics, "--model", model, "--model-sha256", "0" * 64]  # fmt: skip
+                 "--intrinsics", intrinsics, "--matcher", "xfeat", "--model", model,
+                 "--model-sha256", "0" * 64]  # fmt: skip
     assert main([*map(str, arguments)]) == EXIT_FAILED
     told = capsys.readouterr()
     assert told.out == ""
@@ -440,7 +441,7 @@ def test_model_of_another_hash(
                 intrinsics=Intrinsics(width_px=480, height_px=360, fx=405.0, fy=405.0, cx=239.5, cy=179.5),
                 map=MapOptions(pack=str(rendered.store().pack.path)),
                 link=LinkOptions(endpoint="udp:127.0.0.1:0"),
-                matcher=MatcherOptions(model=str(model), model_sha256="0" * 64),
+                matcher=MatcherOptions(name="xfeat", model=str(model), model_sha256="0" * 64),
             )
         )
 

@@ -64,7 +64,6 @@ def test_a_part_of_a_larger_array() -> None:
     assert np.allclose(orientation_field(part), orientation_field(part.copy()), atol=1e-5)
 
 
-@pytest.mark.xfail(strict=True, reason="IPP's cv2.magnitude rounds by the alignment of its buffers")
 def test_same_picture_same_bits() -> None:
     """Wherever in memory its buffers lie: replays must give what the flight gave."""
     image = texture()

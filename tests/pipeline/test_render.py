@@ -564,7 +564,6 @@ def test_what_is_drawn_does_not_change_the_window() -> None:
     assert np.array_equal(window.dop, before[1])
 
 
-@pytest.mark.xfail(strict=True, reason="cv2.remap takes no row of more than 32766 points, and nothing says so")
 def test_as_many_points_as_pixels() -> None:
     place = Place(level, reach_m=60.0)
     view = drawn(place, place.pose(40.0))
