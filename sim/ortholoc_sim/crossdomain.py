@@ -180,8 +180,8 @@ class CrossDomain:
         )
 
     def layers(self, scene: Scene, surface: Float32Array) -> MapLayers:
-        """The map: its DOP of the scene of ``survey``, its DSM of the ``surface`` of a scene: the flight's for xDOP, where
-        a crop that is a metre lower would move the photos, else the survey's."""
+        """The map: its DOP of the scene of ``survey``, its DSM of the ``surface`` of a scene: the flight's for xDOP,
+        where a crop that is a metre lower would move the photos, else the survey's."""
         west, north = self.place.west_m, self.place.south_m + self.height_m
         columns, rows = round(self.width_m / DOP_GSD_M), round(self.height_m / DOP_GSD_M)
         # A survey's orthophoto is resampled from pictures: it has no detail at its own pixel.

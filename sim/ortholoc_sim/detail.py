@@ -64,7 +64,7 @@ class Detail:
                     if weight > 0.0:
                         self._add(factor, mask, weight, (x + east * height, y + north * height), feature_m)
         shaded = view.image * np.clip(factor, 0.3, 1.7)[..., None]
-        return np.clip(shaded, 0, 255).astype(np.uint8)
+        return np.asarray(np.clip(shaded, 0, 255), dtype=np.uint8)
 
     def _add(
         self,
