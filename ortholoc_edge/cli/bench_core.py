@@ -232,8 +232,8 @@ def _hostile(bench: _Bench) -> None:
     )  # fmt: skip
     bench.report.section(
         "Hostile frames",
-        f"{len(numbers)} frames with each matcher, seed {args.seed}. "
-        + ("" if bench.others else "Stale maps were left out: they need --crossdomain."),
+        f"{len(numbers)} frames with each matcher, seed {args.seed}."
+        + ("" if bench.others else " Stale maps were left out: they need --crossdomain."),
         HOSTILE,
     )
     for method in bench.methods:
