@@ -85,7 +85,7 @@ class MapOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """
 
     pack: str
-    cache_mb: Annotated[int, Meta(ge=1)] = 12
+    cache_mb: Annotated[int, Meta(ge=1)] = 20
     memory_mb: Annotated[int, Meta(ge=1)] = 768
     require_intact: bool = False
     public_key: Annotated[str, Meta(min_length=1)] | None = None

@@ -51,6 +51,8 @@ logger = logging.getLogger(__name__)
 # Paper, "Initial Camera Calibration / Localization": matches below are dropped, where the matcher has one.
 MIN_CONFIDENCE = 0.5
 _MIN_MATCHES = 12
+# Where only the typical height of the ground is asked for: a coarse level spares decoding the finest.
+_GROUND_GSD_M = 4.0
 # A map picture finer than the frame is no use; a coarser one than this is hard to match (field-notes, scale).
 _MAX_COARSENING = 3.0
 _UNSTATED_SIGMA_PX = 0.5
@@ -409,7 +411,7 @@ class Localizer:
     def _predicted_ground(self, prior: PosePrior) -> tuple[float, FloatArray]:
         """Typical height of the surface in the predicted view, and the view's footprint (K, 2) on it."""
         pose = prior.map_from_camera
-        ground_m = self._store.ground_near(pose.translation[:2])
+        ground_m = self._store.ground_near(pose.translation[:2], _GROUND_GSD_M)
         if ground_m is None:
             raise RejectedError(
                 Reason.OUTSIDE_MAP,
@@ -426,7 +428,7 @@ class Localizer:
                     0.0,
                 )
             outline = footprint(self.camera, pose, ground_m)
-            heights = self._store.heights(outline)
+            heights = self._store.heights(outline, _GROUND_GSD_M)
             if np.isfinite(heights).any():
                 ground_m = min(float(np.nanmedian(heights)), float(pose.translation[2]) - 0.2 * height_m)
         return ground_m, outline
@@ -635,7 +637,7 @@ class Localizer:
                 )
         pose = scene.local.map_from_local_pose(estimate.local_from_camera)
         covariance = estimate.covariance + self._map_covariance
-        below = float(self._store.heights(pose.translation[None, :2])[0])
+        below = float(self._store.heights(pose.translation[None, :2], _GROUND_GSD_M)[0])
         height_m = float(pose.translation[2]) - (below if math.isfinite(below) else scene.ground_m)
         refusal = gate.check(
             estimate,

@@ -89,7 +89,9 @@ class Exposure:
         np.clip(image, 0.0, 1.0, out=image)
         if self.gamma != 1.0:
             image = np.asarray(cv2.pow(image, self.gamma), dtype=np.float32)
-        image = np.asarray(0.5 + (image - 0.5) * self.contrast, dtype=np.float32)
+        image -= np.float32(0.5)
+        image *= np.float32(self.contrast)
+        image += np.float32(0.5)
         grey = (image @ _LUMA)[..., None]
         image = grey + (image - grey) * np.float32(self.saturation)
         image *= np.float32(255.0)
