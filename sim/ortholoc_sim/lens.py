@@ -93,7 +93,7 @@ class Exposure:
         image *= np.float32(self.contrast)
         image += np.float32(0.5)
         grey = (image @ _LUMA)[..., None]
-        image = grey + (image - grey) * np.float32(self.saturation)
+        image = np.asarray(grey + (image - grey) * np.float32(self.saturation), dtype=np.float32)
         image *= np.float32(255.0)
         sigma = np.float32(self.noise) + np.float32(self.shot) * np.sqrt(np.clip(grey, 0.0, 1.0))
         image += sigma * rng.standard_normal(image.shape, dtype=np.float32)
