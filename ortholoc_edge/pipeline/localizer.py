@@ -232,7 +232,7 @@ class Localizer:
                 terrain = Terrain.of(window, precondition.grey_map(window), local)
             if terrain is None:
                 raise RejectedError(Reason.MAP_NODATA, "the surface model has no data under the predicted view")
-            found = structural.Tracking(query.result(), terrain, prior, self.camera, trace, self._tuning).run(proceed)
+            found = self._track(query.result(), terrain, prior, outline, proceed, trace)
         finally:
             query.cancel()
         if found is None:
@@ -247,6 +247,29 @@ class Localizer:
             limits = gate.for_support(found.support, self._options.gate)
             fix = self._fix(frame, solved, Scene(window, local, ground_m), prior, limits)
         return replace(fix, quality=found.support, timings_ms=trace.timings_ms())
+
+    def _track(
+        self,
+        query: structural.QueryFields,
+        terrain: Terrain,
+        prior: PosePrior,
+        outline: FloatArray,
+        proceed: Callable[[], bool],
+        trace: Trace,
+    ) -> structural.Track | None:
+        """From the prior, and if that does not convince from narrower ones that cover it."""
+        best = structural.Tracking(query, terrain, prior, self.camera, trace, self._tuning).run(proceed)
+        if best is not None and best.convincing:
+            return best
+        for hypothesis in hypotheses(prior, float(np.ptp(outline, axis=0).min())) or []:
+            if hypothesis is prior or not proceed():
+                break
+            found = structural.Tracking(query, terrain, hypothesis, self.camera, trace, self._tuning).run(proceed)
+            if found is not None and (best is None or found.inliers > best.inliers):
+                best = found
+            if best is not None and best.convincing:
+                break
+        return best
 
     def _query_fields(self, tracking: structural.QueryMaker, grey: ImageArray, trace: Trace) -> structural.QueryFields:
         with trace.stage("query_features"):

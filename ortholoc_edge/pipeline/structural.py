@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import product
 
 import cv2
 import numpy as np
@@ -95,6 +96,9 @@ _SEARCH_SIGMAS = 2.5
 _TURN_SIGMAS = 1.7
 _MIN_TURN_RAD, _MAX_TURN_RAD = math.radians(3.0), math.radians(7.0)
 _MAX_TURNS = 9
+# Heights are tried in steps of this factor: half of it is what the first level's radius bears at the rim.
+_ZOOM = 1.2
+_MAX_ZOOMS = 7
 _PEAKS_PER_TURN = 3
 _IMPROBABLE = 0.2
 _CANDIDATES = 6
@@ -237,34 +241,34 @@ class Tracking:
         Args:
             proceed: asked before the search and each of its starts; False ends it.
         """
-        best = self._descend(self._predicted.local_from_camera, first=0)
+        best = self._descend(self._predicted.local_from_camera, look_wide=True)
         if best is not None and best.convincing:
             return best
         for start in self._search() if proceed() else []:
             if not proceed():
                 break
-            found = self._descend(start, first=1)
+            found = self._descend(start, look_wide=False)
             if found is not None and (best is None or found.inliers > best.inliers):
                 best = found
             if best is not None and best.convincing:
                 break
         return best
 
-    def _descend(self, pose: Rigid3, first: int) -> Track | None:
-        """Through the levels from ``first`` on; the whole view's shift is looked for at level 0 only."""
+    def _descend(self, pose: Rigid3, look_wide: bool) -> Track | None:
+        """Through the levels. ``look_wide``: at the first the shift of the whole view is looked for before."""
         steps: list[_Step] = []
         drawn_at = pose
         last = len(self._tuning.levels) - 1
-        for number in range(first, last + 1):
+        for number in range(last + 1):
             known = self._upright if number == last else self._predicted
-            step = self._level(number, drawn_at, pose, known)
+            step = self._level(number, drawn_at, pose, known, look_wide and number == 0)
             if step is None:
                 return None
             pose = step.adjusted.local_from_camera
             if self._tuning.render_again:
                 drawn_at = pose
             if 0 < number < last and step.agreeing < self._tuning.repeat_below:
-                step = self._level(number, drawn_at, pose, known)
+                step = self._level(number, drawn_at, pose, known, look_wide=False)
                 if step is None:
                     return None
                 pose = step.adjusted.local_from_camera
@@ -275,7 +279,9 @@ class Tracking:
             steps.append(step)
         return self._track(steps)
 
-    def _level(self, number: int, drawn_at: Rigid3, pose: Rigid3, known: PoseMeasurement) -> _Step | None:
+    def _level(
+        self, number: int, drawn_at: Rigid3, pose: Rigid3, known: PoseMeasurement, look_wide: bool
+    ) -> _Step | None:
         """Matches of one level, and the pose adjusted to them.
 
         Args:
@@ -290,7 +296,7 @@ class Tracking:
             template = orientation_field(view.image, view.valid)
         whole: tuple[int, int] | None = None
         with self._trace.stage("match"):
-            if number == 0:
+            if look_wide:
                 x, y, _ = structural.whole_shift(template, field, self._reach_px(view))[0]
                 whole = x, y
             elif not self._tuning.render_again:
@@ -305,7 +311,7 @@ class Tracking:
                 origin=whole or (0, 0),
             )
         with self._trace.stage("pose"):
-            step = self._adjusted(number, view, found, template, known, pose, whole if number == 0 else None)
+            step = self._adjusted(number, view, found, template, known, pose, whole if look_wide else None)
             if step is None or not self._tuning.polish or number < len(self._tuning.levels) - 1:
                 return step
             return self._polished(view, found, known, step)
@@ -471,15 +477,16 @@ class Tracking:
         return np.asarray(full, dtype=np.float64)
 
     def _search(self) -> list[Rigid3]:
-        """Poses to start level 1 from, the most promising first: peaks of the whole view's correlation there, over
-        turns of the heading, less what makes them improbable."""
+        """Poses to start from, the most promising first: peaks of the whole view's correlation at the second level,
+        over turns of the heading and heights, less what makes them improbable."""
         camera, field = self._query.cameras[1], self._query.fields[1]
         predicted = self._predicted.local_from_camera
         candidates: list[tuple[float, Rigid3]] = []
         with self._trace.stage("search"):
-            for turn_rad in _turns(self._prior.heading_sigma_rad):
+            for turn_rad, climb_m in product(_turns(self._prior.heading_sigma_rad), self._climbs(predicted)):
                 turned = rotation.exp([0.0, 0.0, turn_rad]) @ predicted.rotation
-                view = render(self._terrain, camera, Rigid3(turned, predicted.translation))
+                raised = predicted.translation + np.array([0.0, 0.0, climb_m])
+                view = render(self._terrain, camera, Rigid3(turned, raised))
                 if view.valid.mean() < _MIN_VALID:
                     continue
                 template = orientation_field(view.image, view.valid)
@@ -490,6 +497,13 @@ class Tracking:
                     candidates.append((peak - _IMPROBABLE * float(error @ self._predicted.information @ error), pose))
         candidates.sort(key=lambda pair: -pair[0])
         return [pose for _, pose in candidates[:_CANDIDATES]]
+
+    def _climbs(self, predicted: Rigid3) -> list[float]:
+        """Changes of height that cover what the prior allows, m."""
+        height_m = max(float(predicted.translation[2]) - self._terrain.lowest_m, 1e-3)
+        sigma = self._prior.height_sigma_m / height_m
+        count = min(math.ceil(_SEARCH_SIGMAS * math.log1p(sigma) / math.log(_ZOOM) - 0.5), _MAX_ZOOMS // 2)
+        return [height_m * (_ZOOM**k - 1.0) for k in range(-count, count + 1)]
 
 
 def _turns(sigma_rad: float) -> list[float]:
