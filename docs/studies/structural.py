@@ -53,7 +53,7 @@ class Variant:
 def render_plane(terrain: Terrain, camera: Camera, pose: Rigid3) -> RenderedView:
     """The view through the plane homography, its points lifted with the surface model afterwards, as in the paper."""
     level = np.full_like(terrain.heights, np.float32(np.median(terrain.heights)))
-    flat = render(replace(terrain, heights=level, lowest_m=float(level[0, 0]), highest_m=float(level[0, 0])), camera, pose)
+    flat = render(replace(terrain, heights=level, lowest_m=float(level[0, 0]), typical_m=float(level[0, 0]), highest_m=float(level[0, 0])), camera, pose)
 
     class Plane(RenderedView):
         def points_local(self, px: np.ndarray) -> np.ndarray:
@@ -64,7 +64,7 @@ def render_plane(terrain: Terrain, camera: Camera, pose: Rigid3) -> RenderedView
                 points[:, 2] = np.where(np.isfinite(heights), heights, points[:, 2])
             return points
 
-    return Plane(flat.image, flat.valid, camera, pose, flat.fall_m, flat.steep)
+    return Plane(flat.image, flat.valid, camera, pose, flat.fall_m)
 
 
 def variants() -> Iterator[Variant]:
@@ -75,7 +75,7 @@ def variants() -> Iterator[Variant]:
     yield Variant("attitude takes no part in the last pose", replace(TUNING, attitude=False))
     yield Variant("all patches count alike", replace(TUNING, match_covariance=False, sigma_px=0.3))
     yield Variant("peaks only, no joint likelihood", replace(TUNING, polish=False))
-    yield Variant("patches at jumps of the surface count a fifth", replace(TUNING, edge_weight=0.2))
+    yield Variant("no look at rivals", patches=((structural.Tracking, "_elsewhere", lambda self, best: None),))
     yield Variant("local mean not taken off", patches=((orientation, "_subtract_local_mean", lambda field, inner: None),))
     yield Variant("no search where the first try does not convince", patches=((structural, "_CANDIDATES", 0),))
     a, b, c = TUNING.levels

@@ -34,9 +34,12 @@ class GateOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     min_inliers: Annotated[int, Meta(ge=6)] = 30
     min_inlier_ratio: Annotated[float, Meta(ge=0, le=1)] = 0.20
     # Of structural matching: part of the patches in view that agree with the pose. Right poses on the real flights
-    # have 0.45 or more; in another season 0.05 or more. Frames of another place have up to 0.03, one row of trees taken
-    # for the next up to 0.14: below the second limit the pose must be where it was expected, within so many sigmas.
+    # have 0.45 or more; in another season 0.05 or more; frames of another place up to 0.03
+    # (docs/studies/structural.md). Below the second limit the pose must be where it was expected, within so many
+    # sigmas.
     min_support: Annotated[float, Meta(ge=0, le=1)] = 0.07
+    # Inliers of the best pose elsewhere within the prior, as a part of this one's.
+    max_rival: Annotated[float, Meta(ge=0)] = 0.6
     sure_support: Annotated[float, Meta(ge=0, le=1)] = 0.15
     unsure_innovation_sigmas: Annotated[float, Meta(gt=0)] = 3.0
     # Convex hull of the inliers over the image's area.
@@ -103,6 +106,13 @@ def well_supported(support: float, options: GateOptions) -> Refusal | None:
     """Chance, and a pattern that repeats, give some patches a place; the right pose gives it to most of them."""
     if support < options.min_support:
         return Refusal(Reason.LOW_INLIER_RATIO, "part of the patches in view that agree", support, options.min_support)
+    return None
+
+
+def without_rival(rival: float, options: GateOptions) -> Refusal | None:
+    """Where a pattern repeats a pose one period further fits as well; nothing in the picture tells which is right."""
+    if rival > options.max_rival:
+        return Refusal(Reason.AMBIGUOUS, "inliers of a pose elsewhere, part of this one's", rival, options.max_rival)
     return None
 
 

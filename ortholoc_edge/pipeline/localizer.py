@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from msgspec import Meta, Struct, field
 
-from ortholoc_edge.errors import MapError
+from ortholoc_edge.errors import ConfigError, MapError
 from ortholoc_edge.geometry import homography
 from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
 from ortholoc_edge.geometry.camera import Camera
@@ -113,7 +113,13 @@ class Localizer:
     ) -> None:
         self.camera = camera
         self._acquire = matcher.acquire if isinstance(matcher, Structural) else matcher
-        self._tracking = structural.QueryMaker(camera, tuning) if isinstance(matcher, Structural) else None
+        if options.calibrate and self._acquire is None:
+            raise ConfigError(
+                "structural matching takes the focal length as it is; to calibrate name a matcher of features, say "
+                "xfeat"
+            )
+        tracks = isinstance(matcher, Structural) and not options.calibrate
+        self._tracking = structural.QueryMaker(camera, tuning) if tracks else None
         self._tuning = tuning
         self._store = store
         self._options = options
@@ -226,7 +232,7 @@ class Localizer:
         try:
             with trace.stage("map_window"):
                 ground_m, outline = self._predicted_ground(prior)
-                gsd_m = self._distance_to_ground(prior, ground_m) / self._working.focal_px
+                gsd_m = self._distance_to_ground(prior, ground_m) / tracking.finest.focal_px
                 window = self._read(search_bounds(outline, prior, ground_m, self._options.search_sigmas), gsd_m)
                 local = self._local_frame(window, ground_m)
                 terrain = Terrain.of(window, precondition.grey_map(window), local)
@@ -235,10 +241,14 @@ class Localizer:
             found = self._track(query.result(), terrain, prior, outline, proceed, trace)
         finally:
             query.cancel()
+        if (found is None or not found.convincing) and not proceed():
+            raise RejectedError(Reason.LATE, "the search ended before anything convinced")
         if found is None:
             raise RejectedError(Reason.FEW_MATCHES, "the map in the predicted view looks nothing like the frame")
         with trace.stage("gate"):
-            refusal = gate.well_supported(found.support, self._options.gate)
+            refusal = gate.well_supported(found.support, self._options.gate) or gate.without_rival(
+                found.rival, self._options.gate
+            )
             if refusal is not None:
                 raise RejectedError(refusal.reason, refusal.detail, refusal.measured, refusal.limit)
             solved = Solved(

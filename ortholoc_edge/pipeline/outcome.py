@@ -26,6 +26,7 @@ class Reason(StrEnum):
     HIGH_REPROJECTION = "high_reprojection"
     DEGENERATE_GEOMETRY = "degenerate_geometry"  # the pose is not determined by the matches
     GRAVITY_DISAGREES = "gravity_disagrees"  # the horizon differs from the autopilot's
+    AMBIGUOUS = "ambiguous"  # another place that the prior allows fits as well: rows of trees, of panels
     PRIOR_DISAGREES = "prior_disagrees"  # heading or position too far from what was predicted
     UNCERTAIN = "uncertain"  # the pose's own covariance is too wide
     LATE = "late"

@@ -27,6 +27,7 @@ _STEP_OF_FOOTPRINT = 0.6
 # Each costs a network pass; more is area search, not tracking.
 MAX_HYPOTHESES = 40
 _MAX_LISTED = 100_000
+_ASYMMETRY = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,6 +44,10 @@ class PosePrior:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "covariance", frozen_floats(self.covariance, (6, 6), "prior covariance"))
+        scale = np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
+        correlation = self.covariance / np.outer(scale, scale)
+        if np.any(np.diag(self.covariance) < 0) or np.abs(correlation - correlation.T).max() > _ASYMMETRY:
+            raise ValueError("prior covariance: not symmetric, or a variance is negative")
 
     @property
     def position_sigma_m(self) -> float:
@@ -108,7 +113,8 @@ def search_bounds(points_map: FloatArray, prior: PosePrior, ground_m: float, sig
             [
                 prior.position_sigma_m,
                 prior.tilt_sigma_rad * (height**2 + clear**2) / height,
-                min(prior.heading_sigma_rad, np.pi) * away,
+                # A turn moves nothing by more than the circle is wide.
+                min(prior.heading_sigma_rad, 2.0 / sigmas) * away,
                 prior.height_sigma_m * clear / height,
             ]
         )

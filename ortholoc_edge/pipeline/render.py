@@ -33,6 +33,9 @@ _POLISHES = 2
 # Picture of the map that is drawn from: the coarsest that has no larger pixels than the view, times this.
 _LEVEL_SLACK = 1.42
 _MIN_PICTURE_PX = 48
+# Of every so many cells along each axis: what is lower than all but this many per cent is an error.
+_SPARSE = 3
+_LOWEST_PERCENTILE = 0.2
 # Rays that start in a crown or below a hilltop start at this part of the height above the lowest ground.
 _CLEARANCE = 0.05
 
@@ -54,7 +57,7 @@ class Terrain:
         local: metric frame that poses are given in.
         heights: (h, w) float32 on ``grid``, m; holes at the lowest height.
         known: (h, w) float32, 1 where the surface model has data, else 0; None: it has everywhere.
-        lowest_m, highest_m: of the heights.
+        lowest_m, typical_m, highest_m: of the heights; the lowest without single low cells, which are errors.
         pictures: of the orthophoto, each half as fine as the one before.
     """
 
@@ -63,6 +66,7 @@ class Terrain:
     heights: Float32Array
     known: Float32Array | None
     lowest_m: float
+    typical_m: float
     highest_m: float
     pictures: tuple[_Picture, ...]
 
@@ -76,12 +80,14 @@ class Terrain:
             if not known.any():
                 return None
             heights = np.where(known, heights, np.float32(heights[known].min()))
+        lowest, typical = np.percentile(heights[::_SPARSE, ::_SPARSE], (_LOWEST_PERCENTILE, 50.0))
         return Terrain(
             local,
             window.dsm_grid,
             heights,
             None if known is None else known.astype(np.float32),
-            float(heights.min()),
+            float(lowest),
+            float(typical),
             float(heights.max()),
             _pyramid(dop_grey, window.dop_valid, window.dop_grid),
         )
@@ -116,7 +122,6 @@ class RenderedView:
         valid: (H, W) bool.
         camera, local_from_camera: that it is drawn for.
         fall_m: (h, w) float32, from the camera's height down to what the nodes' rays meet.
-        steep: (h, w) bool, nodes beside which the surface jumps: a wall or an edge, where the map's point is doubtful.
     """
 
     image: ImageArray
@@ -124,18 +129,12 @@ class RenderedView:
     camera: Camera
     local_from_camera: Rigid3
     fall_m: Float32Array
-    steep: BoolArray
 
     def points_local(self, px: FloatArray) -> FloatArray:
         """Points (N, 3) of the map, local m, that pixels (N, 2) of the view show. They lie on the pixels' rays."""
         rays = self.camera.unproject(px) @ self.local_from_camera.rotation.T
         fall = bilinear(self.fall_m, _node_px(px))
         return np.asarray(self.local_from_camera.translation + rays * (fall / -rays[:, 2])[:, None], dtype=np.float64)
-
-    def is_steep(self, px: FloatArray) -> BoolArray:
-        """Which pixels (N, 2) lie at a jump of the surface."""
-        column, row = np.round(_node_px(px)).astype(np.intp).T
-        return np.asarray(self.steep[row, column])
 
 
 def _node_px(px: FloatArray) -> FloatArray:
@@ -165,7 +164,7 @@ def render(terrain: Terrain, camera: Camera, local_from_camera: Rigid3) -> Rende
     slope_y = (np.where(ahead, north, 0.0) / falling * (local.grid_scale / grid.dy)).astype(np.float32)
     start = local.map_from_local(centre)
     x0, y0 = (np.float32(value) for value in grid.px_from_map(start[:2]))
-    fall, steep = _first_hits(terrain, float(centre[2]), ahead, slope_x, slope_y, x0, y0)
+    fall = _first_hits(terrain, float(centre[2]), ahead, slope_x, slope_y, x0, y0)
     x, y = x0 + slope_x * fall, y0 + slope_y * fall
     seen = ahead & (x >= 0) & (x <= grid.width - 1) & (y >= 0) & (y <= grid.height - 1)
     if terrain.known is not None:
@@ -186,7 +185,7 @@ def render(terrain: Terrain, camera: Camera, local_from_camera: Rigid3) -> Rende
     if picture.valid is not None:
         known = cv2.remap(picture.valid, full_x, full_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
         valid &= np.asarray(known) >= 254
-    return RenderedView(np.asarray(image, dtype=np.uint8), valid, camera, local_from_camera, fall, steep)
+    return RenderedView(np.asarray(image, dtype=np.uint8), valid, camera, local_from_camera, fall)
 
 
 def _first_hits(
@@ -197,8 +196,8 @@ def _first_hits(
     slope_y: Float32Array,
     x0: np.float32,
     y0: np.float32,
-) -> tuple[Float32Array, BoolArray]:
-    """Fall (h, w) at which the rays first meet the surface, and where the surface jumps there."""
+) -> Float32Array:
+    """Fall (h, w) at which the rays first meet the surface."""
 
     def above(fall: Float32Array | np.float32) -> Float32Array:
         """How far above the surface rays are that have fallen so far, m."""
@@ -208,7 +207,9 @@ def _first_hits(
         return np.asarray(np.float32(height_m) - fall - heights, dtype=np.float32)
 
     deepest = max(height_m - terrain.lowest_m, 1e-3)
-    highest = min(max(height_m - terrain.highest_m, _CLEARANCE * deepest), deepest)
+    # A ravine far below must not let rays start in the ground that the camera flies over.
+    over_m = height_m - terrain.typical_m if height_m > terrain.typical_m else deepest
+    highest = min(max(height_m - terrain.highest_m, _CLEARANCE * over_m), deepest)
     run = np.hypot(slope_x, slope_y)
     cells = (deepest - highest) * float(np.percentile(run[ahead], 90)) if ahead.any() else 0.0
     steps = int(np.clip(math.ceil(cells / _CELLS_PER_STEP), _MIN_STEPS, _MAX_STEPS))
@@ -227,12 +228,10 @@ def _first_hits(
         if not open_rays.any():
             break
     reach = np.float32((deepest - highest) / steps)
-    moved = np.zeros_like(fall)
     for _ in range(_POLISHES):
         moved = above(fall)
         np.copyto(fall, fall + moved, where=np.abs(moved) < reach)
-    steep = np.abs(moved) > np.maximum(0.05 * reach, np.float32(0.25))
-    return fall, steep
+    return fall
 
 
 def _picture_for(terrain: Terrain, gsd_m: float) -> _Picture:

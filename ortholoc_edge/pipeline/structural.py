@@ -52,7 +52,6 @@ class Tuning:
     ``match_covariance``: a patch counts by how sharp its peak is, and not as all others.
     ``sigma_px``: standard deviation of a patch's place, px of the level, before that of its peak.
     ``polish``: the last level's pose is where all patches together fit best.
-    ``edge_weight``: of patches whose middle lies at a jump of the surface, where a 2.5D map is doubtful.
     """
 
     levels: tuple[Level, ...] = (Level(128, 6, 8, 6), Level(256, 3, 8, 6, 2), Level(512, 2, 16, 3))
@@ -61,7 +60,6 @@ class Tuning:
     attitude: bool = True
     match_covariance: bool = True
     sigma_px: float = 0.2
-    edge_weight: float = 1.0
     polish: bool = True
 
 
@@ -101,6 +99,13 @@ _ZOOM = 1.2
 _MAX_ZOOMS = 7
 _PEAKS_PER_TURN = 3
 _IMPROBABLE = 0.2
+# A rival: one of so many peaks of the whole view's correlation at the second level, of so much of the height of the
+# track's own, hardly less probable (squared sigmas), that ends elsewhere (part of the height above ground).
+_RIVAL_PEAKS = 5
+_RIVAL_PEAK = 0.6
+_RIVAL_LESS_PROBABLE = 16.0
+_OWN_PEAK_PX = 4.0
+_APART = 0.01
 _CANDIDATES = 6
 # Of the last level's patches: independent samples (48 x 48 px, correlated over 3, shared with neighbours), and the
 # highest correlation that counts.
@@ -142,6 +147,11 @@ class QueryMaker:
             distorted = camera.resized(last.width, last.height).project(rays).astype(np.float32)
             self._undistortion = distorted[..., 0], distorted[..., 1]
 
+    @property
+    def finest(self) -> Camera:
+        """Of the last level."""
+        return self._cameras[-1]
+
     def fields(self, grey: ImageArray) -> QueryFields:
         """Of a frame (H, W)."""
         last = self._cameras[-1]
@@ -173,16 +183,18 @@ class Track:
         estimate: at the frame's full size.
         query_px: (M, 2) px of the frame without distortion; points_local: (M, 3).
         support: part of the patches in view that agree with the pose.
-        score: median of how well those fit, at most 1.
         convincing: whether other ways need not be tried.
+        second_view: drawn at the second level near this pose, and its field.
+        rival: inliers of the best track elsewhere, as a part of this one's.
     """
 
     estimate: PoseEstimate
     query_px: FloatArray
     points_local: FloatArray
     support: float
-    score: float
     convincing: bool
+    second_view: tuple[RenderedView, Float32Array]
+    rival: float = 0.0
 
     @property
     def inliers(self) -> int:
@@ -191,9 +203,11 @@ class Track:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Step:
-    """One level's outcome: matches (N) of level px and local points, how well they fit, how sure their places are, and
-    which agree with the pose; and how many patches were in view."""
+    """One level's outcome: the view that was drawn and its field; matches (N) of level px and local points, how well
+    they fit, how sure their places are, and which agree with the pose; and how many patches were in view."""
 
+    view: RenderedView
+    template: Float32Array
     adjusted: Adjusted
     px: FloatArray
     points: FloatArray
@@ -241,6 +255,15 @@ class Tracking:
         Args:
             proceed: asked before the search and each of its starts; False ends it.
         """
+        best = self._best(proceed)
+        other = None if best is None else self._elsewhere(best)
+        if best is None or other is None:
+            return best
+        if other.inliers > best.inliers:
+            best, other = other, best
+        return replace(best, rival=other.inliers / best.inliers)
+
+    def _best(self, proceed: Callable[[], bool]) -> Track | None:
         best = self._descend(self._predicted.local_from_camera, look_wide=True)
         if best is not None and best.convincing:
             return best
@@ -253,6 +276,33 @@ class Tracking:
             if best is not None and best.convincing:
                 break
         return best
+
+    def _elsewhere(self, best: Track) -> Track | None:
+        """The best track that ends elsewhere: rows of trees or of panels fit one row further, too."""
+        found_pose, (view, template) = best.estimate.local_from_camera, best.second_view
+        field = self._query.fields[1]
+        peaks = structural.whole_shift(template, field, self._reach_px(view), _RIVAL_PEAKS)
+        own = max((peak for x, y, peak in peaks if math.hypot(x, y) <= _OWN_PEAK_PX), default=peaks[0][2])
+        limit = self._improbability(found_pose) + _RIVAL_LESS_PROBABLE
+        found: Track | None = None
+        for x, y, peak in peaks:
+            if math.hypot(x, y) <= _OWN_PEAK_PX or peak < _RIVAL_PEAK * own:
+                continue
+            start = _moved_sideways(view, _middle_px(template), np.array([x, y], dtype=np.float64))
+            if self._improbability(start) > limit:
+                continue
+            rival = self._descend(start, look_wide=False)
+            if rival is None:
+                continue
+            apart = rival.estimate.local_from_camera.translation - found_pose.translation
+            if float(np.linalg.norm(apart)) > _APART * max(float(np.median(view.fall_m)), 1e-3):
+                found = rival if found is None or rival.inliers > found.inliers else found
+        return found
+
+    def _improbability(self, pose: Rigid3) -> float:
+        """Squared sigmas of a pose from the predicted one."""
+        error = self._predicted.error(pose)
+        return float(error @ self._predicted.information @ error)
 
     def _descend(self, pose: Rigid3, look_wide: bool) -> Track | None:
         """Through the levels. ``look_wide``: at the first the shift of the whole view is looked for before."""
@@ -297,8 +347,7 @@ class Tracking:
         whole: tuple[int, int] | None = None
         with self._trace.stage("match"):
             if look_wide:
-                x, y, _ = structural.whole_shift(template, field, self._reach_px(view))[0]
-                whole = x, y
+                whole = self._likely_shift(view, template, field)
             elif not self._tuning.render_again:
                 whole = self._middle_shift(view, template, pose)
             found = structural.correlate(
@@ -351,6 +400,17 @@ class Tracking:
             inliers=np.asarray(np.linalg.norm(residuals, axis=1) <= _LAST_INLIER_PX),
         )
 
+    def _likely_shift(self, view: RenderedView, template: Float32Array, field: Float32Array) -> tuple[int, int]:
+        """Of the whole view: the highest peak, less what makes it improbable."""
+        middle = _middle_px(template)
+
+        def likely(peak: tuple[int, int, float]) -> float:
+            pose = _moved_sideways(view, middle, np.array(peak[:2], dtype=np.float64))
+            return peak[2] - _IMPROBABLE * self._improbability(pose)
+
+        x, y, _ = max(structural.whole_shift(template, field, self._reach_px(view), _PEAKS_PER_TURN), key=likely)
+        return x, y
+
     def _middle_shift(self, view: RenderedView, template: Float32Array, pose: Rigid3) -> tuple[int, int]:
         middle = _middle_px(template)
         seen = view.camera.project(pose.inverse().apply(view.points_local(middle)))
@@ -384,7 +444,7 @@ class Tracking:
         px, seen_px = found_well.template_px, found_well.template_px + found_well.shift_px
         # Patches overlap: so many share their pixels.
         shared = max((level.patch_cells / level.stride) ** 2 / 4.0, 1.0)
-        information = self._information(view, found_well) / shared
+        information = self._information(found_well) / shared
         if whole is not None:
             middle = _middle_px(template)
             px, seen_px = np.vstack([px, middle]), np.vstack([seen_px, middle + whole])
@@ -408,6 +468,8 @@ class Tracking:
         limit = _LAST_INLIER_PX if number == len(self._tuning.levels) - 1 else _INLIER_PX
         inliers = np.linalg.norm(adjusted.residuals_px, axis=1) <= limit
         return _Step(
+            view,
+            template,
             adjusted,
             seen_px[: len(found_well)],
             points[: len(found_well)],
@@ -417,16 +479,12 @@ class Tracking:
             int(np.count_nonzero(_shown(view, found.template_px))),
         )
 
-    def _information(self, view: RenderedView, found: structural.Displacements) -> FloatArray:
+    def _information(self, found: structural.Displacements) -> FloatArray:
         """(N, 2, 2) of the patches' places, px^-2, as if they shared no pixel."""
         covariance = np.broadcast_to(np.eye(2) * self._tuning.sigma_px**2, (len(found), 2, 2))
         if self._tuning.match_covariance:
             covariance = covariance + found.covariance
-        information = np.linalg.inv(covariance)
-        if self._tuning.edge_weight != 1.0:
-            at_edge = view.is_steep(found.template_px)
-            information = information * np.where(at_edge, self._tuning.edge_weight, 1.0)[:, None, None]
-        return np.asarray(information, dtype=np.float64)
+        return np.asarray(np.linalg.inv(covariance), dtype=np.float64)
 
     def _track(self, steps: list[_Step]) -> Track | None:
         last, camera = steps[-1], self._query.cameras[-1]
@@ -450,8 +508,8 @@ class Tracking:
             and support >= _CONVINCING_SUPPORT
             and all(step.agreeing >= _CONVINCING_BEFORE for step in steps)
         )
-        score = float(np.median(last.scores[last.inliers]))
-        return Track(estimate, resize_px(last.px, scale), last.points, support, score, convincing)
+        second = steps[1].view, steps[1].template
+        return Track(estimate, resize_px(last.px, scale), last.points, support, convincing, second)
 
     def _covariance(self, step: _Step, camera: Camera) -> FloatArray | None:
         """(6, 6): of what was seen, together with the attitude that was known; None if that determines no pose."""
@@ -460,9 +518,9 @@ class Tracking:
             return None
         side = max(camera.width, camera.height) / _CLUSTERS_ACROSS
         column, row = np.floor(step.px[inliers] / side).astype(np.intp).T
-        # Whitened, so that a patch along an edge counts across it.
-        whitener = np.linalg.cholesky(step.information[inliers]).transpose(0, 2, 1)
         try:
+            # Whitened, so that a patch along an edge counts across it.
+            whitener = np.linalg.cholesky(step.information[inliers]).transpose(0, 2, 1)
             seen = _absorbed_error_factor(step.scores[inliers]) * cov.clustered(
                 whitener @ step.adjusted.jacobian[inliers],
                 np.einsum("nij,nj->ni", whitener, step.adjusted.residuals_px[inliers]),
@@ -493,8 +551,7 @@ class Tracking:
                 middle = _middle_px(template)
                 for x, y, peak in structural.whole_shift(template, field, self._reach_px(view), _PEAKS_PER_TURN):
                     pose = _moved_sideways(view, middle, np.array([x, y], dtype=np.float64))
-                    error = self._predicted.error(pose)
-                    candidates.append((peak - _IMPROBABLE * float(error @ self._predicted.information @ error), pose))
+                    candidates.append((peak - _IMPROBABLE * self._improbability(pose), pose))
         candidates.sort(key=lambda pair: -pair[0])
         return [pose for _, pose in candidates[:_CANDIDATES]]
 

@@ -228,8 +228,8 @@ class MapStore:
         return None
 
     def heights(self, xy_map: npt.ArrayLike, gsd_m: float = 0.0) -> FloatArray:
-        """Heights (N,) at map positions (N, 2), bilinear on the coarsest level that is no coarser than ``gsd_m``; on the
-        full resolution if none is.
+        """Heights (N,) at map positions (N, 2), bilinear on the coarsest level that is no coarser than ``gsd_m``; on
+        the full resolution if none is.
 
         NaN outside, within half a cell of the edge, and wherever a cell that carries weight has no data.
         """
