@@ -107,10 +107,10 @@ class MatcherOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     model_sha256: str | None = None
 
     def __post_init__(self) -> None:
-        if self.name.removeprefix("structural+") == "xfeat" and self.working_px % _XFEAT_MULTIPLE_PX:
+        if "xfeat" in self.name and self.working_px % _XFEAT_MULTIPLE_PX:
             below = self.working_px - self.working_px % _XFEAT_MULTIPLE_PX
             raise ValueError(
-                f"working_px = {self.working_px} is no multiple of {_XFEAT_MULTIPLE_PX}, as the matcher xfeat needs; "
+                f"working_px = {self.working_px} is no multiple of {_XFEAT_MULTIPLE_PX}, as the matcher {self.name} needs; "
                 f"write {below} or {below + _XFEAT_MULTIPLE_PX}"
             )
 

@@ -54,7 +54,6 @@ def write(folder: Path, *changes: tuple[str, str]) -> Path:
         ('"nadir-nose-up" ', '"sideways" ', r"\$\.mount\.preset"),
         ('send = ["odometry"]', "send = []", r"link\.send"),
         ('folder = "/var/log/ortholoc-edge"', 'folder = ""', r"\$\.log\.folder"),
-        ("working_px = 640", "working_px = 650", r"no multiple of 32.*640 or 672.*\$\.matcher"),
         # One table against another.
         ("# width_px = 1280", "width_px = 640", r"camera\.width_px.* 640.*intrinsics\.width_px.* 1280"),
         ("# height_px = 720", "height_px = 1080", r"camera\.height_px.* 1080.*intrinsics\.height_px.* 720"),
@@ -72,10 +71,10 @@ def test_refused_with_file_and_key(old: str, new: str, named: str, tmp_path: Pat
     [
         [],
         [("# width_px = 1280", "width_px = 1280"), ("# height_px = 720", "height_px = 720")],
-        [('name = "xfeat"', 'name = "sift"'), ("working_px = 640", "working_px = 650")],
-        [('name = "xfeat"', 'name = "structural"'), ("working_px = 640", "working_px = 650")],
-        [('name = "xfeat"', 'name = "structural+sift"'), ("working_px = 640", "working_px = 650")],
-        [('name = "xfeat"', 'name = "structural+xfeat"')],
+        [('name = "structural"', 'name = "sift"'), ("working_px = 640", "working_px = 650")],
+        [("working_px = 640", "working_px = 650")],
+        [('name = "structural"', 'name = "structural+sift"'), ("working_px = 640", "working_px = 650")],
+        [('name = "structural"', 'name = "structural+xfeat"')],
         [('folder = "/var/log/ortholoc-edge"', "")],
         [('preset = "nadir-nose-up"', 'preset = "forward"'), ("pitch_deg = 0.0", "pitch_deg = -60")],
     ],
@@ -86,8 +85,9 @@ def test_accepted(changes: list[tuple[str, str]], tmp_path: Path) -> None:
     assert config.mount.body_from_camera().translation.tolist() == [0.0, 0.0, 0.0]
 
 
-def test_the_second_matcher_s_numbers_are_checked_too(tmp_path: Path) -> None:
-    path = write(tmp_path, ('name = "xfeat"', 'name = "structural+xfeat"'), ("working_px = 640", "working_px = 650"))
+@pytest.mark.parametrize("name", ["xfeat", "xfeat-star", "xfeat-lighterglue", "structural+xfeat"])
+def test_numbers_of_the_matcher_of_features_are_checked(name: str, tmp_path: Path) -> None:
+    path = write(tmp_path, ('name = "structural"', f'name = "{name}"'), ("working_px = 640", "working_px = 650"))
     with pytest.raises(ConfigError, match=r"no multiple of 32.*640 or 672.*\$\.matcher"):
         read_config(path)
 

@@ -93,7 +93,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--calibrate", action="store_true", help="solve for the focal length too")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--overlay", type=Path, metavar="PNG", help="draw the matched points on the photo")
-    matcher_options.add(parser)
+    # A single photo often comes without an attitude, or without any position.
+    matcher_options.add(parser, default="structural+sift")
     matcher_options.add_features(parser)
     parser.set_defaults(run=run)
 

@@ -9,15 +9,15 @@ from ortholoc_edge.cli.arguments import positive_int
 from ortholoc_edge.cli.progress import ProgressBar
 from ortholoc_edge.config import MatcherOptions
 from ortholoc_edge.matching.registry import METHODS, make_method
-from ortholoc_edge.matching.types import AnyMatcher
+from ortholoc_edge.matching.types import STRUCTURAL, AnyMatcher
 
 
-def add(parser: argparse.ArgumentParser) -> None:
+def add(parser: argparse.ArgumentParser, default: str = STRUCTURAL) -> None:
     group = parser.add_argument_group("matching")
     group.add_argument(
         "--matcher",
         choices=METHODS,
-        default="structural",
+        default=default,
         metavar="NAME",
         help=f"{', '.join(METHODS)}. Structural matching needs no model and a predicted pose; with +NAME that matcher "
         "takes the frames that it can't place (default: %(default)s)",

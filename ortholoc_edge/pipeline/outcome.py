@@ -55,7 +55,7 @@ class Fix:
         camera: the intrinsics of the pose: the configured ones, or calibrated.
         focal_sigma_px: 1-sigma of a calibrated focal length; None if it was given.
         covariance: (6, 6); position in map axes (m), then rotation vector in map axes (rad):
-            ``R_true = exp(d) @ R_estimated``.
+            ``R_true = exp(d) @ R_estimated``. Of structural matching the autopilot's attitude is in it, with its sigma.
         quality: 0..1, the inlier ratio of a round whose pairs were not picked by a pose; of structural matching the
             part of the patches in view that agree. For displays and for MAVLink's quality field.
         matches, inliers: counts of the round that gave the pose.
