@@ -110,8 +110,8 @@ class MatcherOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         if "xfeat" in self.name and self.working_px % _XFEAT_MULTIPLE_PX:
             below = self.working_px - self.working_px % _XFEAT_MULTIPLE_PX
             raise ValueError(
-                f"working_px = {self.working_px} is no multiple of {_XFEAT_MULTIPLE_PX}, as the matcher {self.name} needs; "
-                f"write {below} or {below + _XFEAT_MULTIPLE_PX}"
+                f"working_px = {self.working_px} is no multiple of {_XFEAT_MULTIPLE_PX}, as the matcher {self.name} "
+                f"needs; write {below} or {below + _XFEAT_MULTIPLE_PX}"
             )
 
 

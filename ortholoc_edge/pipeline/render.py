@@ -33,9 +33,11 @@ _POLISHES = 2
 # Picture of the map that is drawn from: the coarsest that has no larger pixels than the view, times this.
 _LEVEL_SLACK = 1.42
 _MIN_PICTURE_PX = 48
-# Of every so many cells along each axis: what is lower than all but this many per cent is an error.
-_SPARSE = 3
-_LOWEST_PERCENTILE = 0.2
+# Of so many cells or more along each axis: what lies below all but this many per cent by half of their depth and some
+# metres is an error.
+_SAMPLES_PER_SIDE = 100
+_LOW_PERCENTILE = 0.2
+_LOW_SLACK_M = 5.0
 # Rays that start in a crown or below a hilltop start at this part of the height above the lowest ground.
 _CLEARANCE = 0.05
 
@@ -80,13 +82,15 @@ class Terrain:
             if not known.any():
                 return None
             heights = np.where(known, heights, np.float32(heights[known].min()))
-        lowest, typical = np.percentile(heights[::_SPARSE, ::_SPARSE], (_LOWEST_PERCENTILE, 50.0))
+        every = max(min(heights.shape) // _SAMPLES_PER_SIDE, 1)
+        low, typical = np.percentile(heights[::every, ::every], (_LOW_PERCENTILE, 50.0))
+        believable = low - 0.5 * (typical - low) - _LOW_SLACK_M
         return Terrain(
             local,
             window.dsm_grid,
             heights,
             None if known is None else known.astype(np.float32),
-            float(lowest),
+            max(float(heights.min()), float(believable)),
             float(typical),
             float(heights.max()),
             _pyramid(dop_grey, window.dop_valid, window.dop_grid),

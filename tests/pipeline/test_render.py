@@ -233,7 +233,6 @@ def test_no_pixels_no_points() -> None:
     place = Place(level, reach_m=40.0)
     view = drawn(place, place.pose())
     assert view.points_local(np.empty((0, 2))).shape == (0, 3)
-    assert view.is_steep(np.empty((0, 2))).shape == (0,)
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 40.0, 65.0])
@@ -320,24 +319,6 @@ def test_roof_is_shown_and_what_is_behind_the_house_is_not() -> None:
     free = seen_px(3.0, 30.0, 0.0)
     point = place.local.map_from_local(view.points_local(free))[0] - (EAST, NORTH, GROUND_M)
     assert point == pytest.approx([3.0, 30.0, 0.0], abs=0.2)
-
-
-def test_steep_is_where_the_surface_jumps() -> None:
-    """On the wall of a house that is looked at from the side; not on level ground, nor on the roof."""
-    place = Place(house, reach_m=120.0)
-    view = drawn(place, place.pose(30.0, 50.0, heading_deg=0.0, north_m=-40.0))
-    inverse = view.local_from_camera.inverse()
-
-    def seen_px(east: float, north: float, up: float) -> FloatArray:
-        point = place.local.local_from_map([EAST + east, NORTH + north, GROUND_M + up])
-        return view.camera.project(inverse.apply(point))[None]
-
-    facade = np.concatenate([seen_px(3.0, -11.0, up) for up in np.linspace(1.0, 8.0, 15)])
-    assert view.is_steep(facade).mean() > 0.6
-    assert not view.is_steep(seen_px(3.0, -4.0, 9.0)).any()
-    assert not view.is_steep(seen_px(3.0, -20.0, 0.0)).any()
-    flat = drawn(Place(level, reach_m=120.0), place.pose(30.0, 50.0, heading_deg=0.0))
-    assert not flat.is_steep(shown(flat, 5)).any()
 
 
 # -- what pixels show --------------------------------------------------------
@@ -534,6 +515,18 @@ def test_a_window_of_two_by_two_cells(up: float) -> None:
     assert len(px) > 300
     truth = cast(place, view, px, window.dsm, window.dsm_grid)
     assert np.nanmax(np.linalg.norm(view.points_local(px) - truth, axis=1)) < 0.3
+
+
+def test_one_low_cell_is_no_ground() -> None:
+    """An undeclared nodata value must not put the rays' steps kilometres apart."""
+    place = Place(ramp, reach_m=60.0)
+    window = place.window
+    pose = place.pose(40.0)
+    sound = drawn(place, pose)
+    window.dsm[3, 4] = -9999.0
+    spoilt = drawn(place, pose, window=window)
+    px = shown(sound, 11)
+    np.testing.assert_allclose(spoilt.points_local(px), sound.points_local(px), atol=0.02)
 
 
 def test_no_height_at_all_is_no_terrain() -> None:

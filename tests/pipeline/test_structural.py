@@ -15,7 +15,7 @@ import pytest
 from replay import rendered
 from scenes_pipeline import turned_down
 
-from ortholoc_edge.errors import MapError
+from ortholoc_edge.errors import ConfigError, MapError
 from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.grid import RasterGrid
@@ -340,13 +340,18 @@ def test_prior_sigmas_that_lie_do_not_make_a_wrong_fix() -> None:
 TURNED_AWAY = rendered.prior(NADIR, error_deg=(0.5, -0.5, 60.0), sigma_deg=(1.0, 1.0, 40.0))
 
 
-def test_features_take_over_where_structure_fails() -> None:
+def test_a_heading_far_off_is_found_by_narrower_priors() -> None:
+    assert_near(localize(rendered.frame(NADIR), TURNED_AWAY), NADIR)
+
+
+def test_features_take_over_where_structure_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Tracking, "run", lambda *_: None)
     frame = rendered.frame(NADIR)
-    assert_rejected(localize(frame, TURNED_AWAY), Reason.FEW_MATCHES, Reason.FEW_INLIERS, Reason.LOW_INLIER_RATIO)
+    assert_rejected(localize(frame, TURNED_AWAY), Reason.FEW_MATCHES)
     fix = assert_near(localize(frame, TURNED_AWAY, Structural(acquire=rendered.sift())), NADIR)
     # It was SIFT: only there is AdHoP.
     assert fix.adhop_accepted is not None
-    assert {"search", "adhop"} <= set(fix.timings_ms)
+    assert "adhop" in fix.timings_ms
 
 
 def test_features_are_not_asked_where_structure_is_enough() -> None:
@@ -375,7 +380,7 @@ def test_no_time_left_no_second_way() -> None:
         return False
 
     outcome = localize(rendered.frame(NADIR), TURNED_AWAY, Structural(acquire=rendered.sift()), proceed=proceed)
-    refused = assert_rejected(outcome, Reason.FEW_MATCHES, Reason.FEW_INLIERS, Reason.LOW_INLIER_RATIO)
+    refused = assert_rejected(outcome, Reason.LATE)
     assert asked
     assert "adhop" not in refused.timings_ms
 
@@ -507,6 +512,32 @@ def test_matches_are_in_pixels_of_the_full_frame() -> None:
     seen = camera.project(truth.inverse().apply(found.points_local))
     off = (seen - found.query_px)[found.estimate.inliers]
     assert np.abs(np.median(off, axis=0)).max() < 0.25
+
+
+def orchard(window: MapWindow) -> None:
+    """Trees 8 m apart, all alike."""
+    v, u = np.mgrid[: window.dop.shape[0], : window.dop.shape[1]] * 0.4
+    near = np.hypot((u % 8.0) - 4.0, (v % 8.0) - 4.0)
+    window.dop[:] = np.where(near < 1.6, 60, 160).astype(np.uint8)[..., None]
+    window.dsm[:] = GROUND_M
+
+
+def test_a_pattern_that_repeats_has_a_rival() -> None:
+    """Whatever place it is given, one row further fits as well."""
+    trees, truth = painted(holes=orchard), camera_at()
+    found = track(trees, render(trees, CAMERA, truth).image, predicted(trees, truth))
+    assert found is not None
+    assert found.convincing
+    assert found.rival > GateOptions().max_rival
+    blots = painted()
+    alone = track(blots, render(blots, CAMERA, truth).image, predicted(blots, truth))
+    assert alone is not None
+    assert alone.rival < 0.5 * GateOptions().max_rival
+
+
+def test_calibration_needs_features() -> None:
+    with pytest.raises(ConfigError, match="focal length"):
+        Localizer(rendered.CAMERA, rendered.store(), Structural(), LocalizerOptions(calibrate=True))
 
 
 def no_heights_east(window: MapWindow) -> None:
