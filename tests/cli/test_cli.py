@@ -141,7 +141,7 @@ def test_impossible_numbers_are_usage_errors(line: str, named: str, capsys: pyte
     assert named in told
 
 
-@pytest.mark.parametrize("command", ["replay x --pack y", "sim", "bench ."])
+@pytest.mark.parametrize("command", ["replay x --pack y --matcher xfeat", "sim --matcher xfeat", "bench ."])
 def test_working_size_for_xfeat_is_named(
     command: str, tmp_path: Path, flight: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -218,7 +218,10 @@ def test_missing_files_are_named(
         (EXIT_FAILED, ["localize", gone, "--pack", PACK, "--intrinsics", intrinsics, *SIFT]),
         (EXIT_FAILED, ["localize", photo, "--pack", gone, "--intrinsics", intrinsics, *SIFT]),
         (EXIT_CONFIG, ["localize", photo, "--pack", PACK, "--intrinsics", gone, *SIFT]),
-        (EXIT_FAILED, ["localize", photo, "--pack", PACK, "--intrinsics", intrinsics, "--model", gone]),
+        (
+            EXIT_FAILED,
+            ["localize", photo, "--pack", PACK, "--intrinsics", intrinsics, "--matcher", "xfeat", "--model", gone],
+        ),
         (EXIT_FAILED, ["replay", gone, "--pack", PACK, *SIFT]),
         (EXIT_FAILED, ["replay", flight, "--pack", gone, *SIFT]),
         (EXIT_FAILED, ["replay", tmp_path, "--pack", PACK, *SIFT]),

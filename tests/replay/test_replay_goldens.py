@@ -16,7 +16,7 @@ from ortholoc_edge.bench import metrics, sequence
 from ortholoc_edge.bench.replay import FrameResult, PriorKind, PriorNoise
 from ortholoc_edge.bench.runner import run_flight
 from ortholoc_edge.matching.sift import SiftMatcher
-from ortholoc_edge.matching.types import Matcher
+from ortholoc_edge.matching.types import AnyMatcher, Matcher, Structural
 from ortholoc_edge.matching.xfeat import XFeatMatcher
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
 from ortholoc_edge.pipeline.outcome import Fix
@@ -39,7 +39,7 @@ RENDERED = [
 ]
 
 
-def replayed(folder: Path, store: MapStore, matcher: Matcher) -> list[FrameResult]:
+def replayed(folder: Path, store: MapStore, matcher: AnyMatcher) -> list[FrameResult]:
     """As ``ortholoc-edge replay`` does it by default: odometer prior, seed 0."""
     recorded = sequence.read_flight(folder)
     return list(run_flight(recorded, store, matcher, LocalizerOptions(), PriorKind.ODOMETER, PriorNoise(), 0))
@@ -94,7 +94,7 @@ def xfeat(xfeat_model: Any) -> Matcher:
 _runs: dict[tuple[str, str], list[FrameResult]] = {}
 
 
-def real_flight(name: str, matcher: Matcher) -> list[FrameResult]:
+def real_flight(name: str, matcher: AnyMatcher) -> list[FrameResult]:
     """Each flight is flown once, for its golden and its figures."""
     store = rendered.real_store(name)
     if (name, matcher.name) not in _runs:
@@ -109,6 +109,25 @@ def test_rendered_flight_is_as_it_was(tmp_path: Path, rewrite_goldens: bool) -> 
     assert len(found) >= 5
     assert max(e.te_m for e in found) < 3.0
     assert max(e.re_deg for e in found) < 1.5
+
+
+def test_rendered_flight_by_structure_is_as_it_was(tmp_path: Path, rewrite_goldens: bool) -> None:
+    results = replayed(rendered.write_flight(tmp_path, RENDERED), rendered.store(), Structural())
+    compare("rendered_structural", results, rewrite_goldens)
+    assert max(r.error.te_m for r in results if r.error is not None) < 1.5
+
+
+def test_seneca_by_structure_is_as_it_was(rewrite_goldens: bool) -> None:
+    compare("seneca_structural", real_flight("seneca", Structural()), rewrite_goldens)
+
+
+@pytest.mark.parametrize("name", ["seneca", "caliterra", "copr"])
+def test_real_flight_by_structure_is_accurate(name: str) -> None:
+    """Issue 4: tracking with an odometer, attitude to 1, 1 and 3 degrees: every frame within 1 m and 1 degree."""
+    results = real_flight(name, Structural())
+    found = [r.error for r in results if r.error is not None]
+    assert metrics.recall(found, len(results))["1m_1deg"] == 1.0
+    assert float(np.median([e.te_m for e in found])) <= 0.12
 
 
 def test_seneca_is_as_it_was(matchers: list[Matcher], rewrite_goldens: bool) -> None:
