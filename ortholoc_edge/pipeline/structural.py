@@ -99,6 +99,7 @@ _ZOOM = 1.2
 _MAX_ZOOMS = 7
 _PEAKS_PER_TURN = 3
 _IMPROBABLE = 0.2
+_CANDIDATES = 6
 # A rival: one of so many peaks of the whole view's correlation at the second level, of so much of the height of the
 # track's own, hardly less probable (squared sigmas), that ends elsewhere (part of the height above ground).
 _RIVAL_PEAKS = 5
@@ -106,7 +107,6 @@ _RIVAL_PEAK = 0.6
 _RIVAL_LESS_PROBABLE = 16.0
 _OWN_PEAK_PX = 4.0
 _APART = 0.01
-_CANDIDATES = 6
 # Of the last level's patches: independent samples (48 x 48 px, correlated over 3, shared with neighbours), and the
 # highest correlation that counts.
 _SAMPLES = 80.0
@@ -117,8 +117,8 @@ _SMALL_CHANGE = 0.02
 # Matches closer than a fifth of the long side share the errors of a patch of the map and of the camera's model.
 _CLUSTERS_ACROSS = 5
 # On the variance: errors that vary slowly are absorbed by the pose. With 2.5, as in `pose.pnp`, the real flights'
-# normalised error averages 0.65 of what it should. The worse the patches fit, the
-# more of them are another season's shadows and crowns, which err alike.
+# normalised error averages 0.65 of what it should. The worse the patches fit, the more of them are another season's
+# shadows and crowns, which err alike.
 _ABSORBED_ERROR_FACTOR = 1.9
 _DOUBTFUL_SCORE, _DOUBT_POWER = 0.38, 8
 # Also where a prior claims to be exact there is something to divide by: 1 mm, 1e-5 rad.
@@ -281,14 +281,13 @@ class Tracking:
         """The best track that ends elsewhere: rows of trees or of panels fit one row further, too."""
         found_pose, (view, template) = best.estimate.local_from_camera, best.second_view
         field = self._query.fields[1]
-        peaks = structural.whole_shift(template, field, self._reach_px(view), _RIVAL_PEAKS)
-        own = max((peak for x, y, peak in peaks if math.hypot(x, y) <= _OWN_PEAK_PX), default=peaks[0][2])
+        peaks = self._shifted(view, template, field, _RIVAL_PEAKS)
+        own = max((peak for (x, y), peak, _ in peaks if math.hypot(x, y) <= _OWN_PEAK_PX), default=peaks[0][1])
         limit = self._improbability(found_pose) + _RIVAL_LESS_PROBABLE
         found: Track | None = None
-        for x, y, peak in peaks:
+        for (x, y), peak, start in peaks:
             if math.hypot(x, y) <= _OWN_PEAK_PX or peak < _RIVAL_PEAK * own:
                 continue
-            start = _moved_sideways(view, _middle_px(template), np.array([x, y], dtype=np.float64))
             if self._improbability(start) > limit:
                 continue
             rival = self._descend(start, look_wide=False)
@@ -311,19 +310,17 @@ class Tracking:
         last = len(self._tuning.levels) - 1
         for number in range(last + 1):
             known = self._upright if number == last else self._predicted
-            step = self._level(number, drawn_at, pose, known, look_wide and number == 0)
-            if step is None:
-                return None
-            pose = step.adjusted.local_from_camera
-            if self._tuning.render_again:
-                drawn_at = pose
-            if 0 < number < last and step.agreeing < self._tuning.repeat_below:
-                step = self._level(number, drawn_at, pose, known, look_wide=False)
+            passes = 2 if 0 < number < last else 1
+            while True:
+                step = self._level(number, drawn_at, pose, known, look_wide and number == 0)
                 if step is None:
                     return None
                 pose = step.adjusted.local_from_camera
                 if self._tuning.render_again:
                     drawn_at = pose
+                passes -= 1
+                if not passes or step.agreeing >= self._tuning.repeat_below:
+                    break
             if number > 0 and step.agreeing < _HOPELESS:
                 return None
             steps.append(step)
@@ -402,14 +399,22 @@ class Tracking:
 
     def _likely_shift(self, view: RenderedView, template: Float32Array, field: Float32Array) -> tuple[int, int]:
         """Of the whole view: the highest peak, less what makes it improbable."""
+        peaks = self._shifted(view, template, field, _PEAKS_PER_TURN)
+        return max(peaks, key=lambda found: self._merit(found[1], found[2]))[0]
+
+    def _shifted(
+        self, view: RenderedView, template: Float32Array, field: Float32Array, count: int
+    ) -> list[tuple[tuple[int, int], float, Rigid3]]:
+        """Shifts of the whole view that correlate best, how well, and the poses that they mean."""
         middle = _middle_px(template)
+        return [
+            ((x, y), peak, _moved_sideways(view, middle, np.array([x, y], dtype=np.float64)))
+            for x, y, peak in structural.whole_shift(template, field, self._reach_px(view), count)
+        ]
 
-        def likely(peak: tuple[int, int, float]) -> float:
-            pose = _moved_sideways(view, middle, np.array(peak[:2], dtype=np.float64))
-            return peak[2] - _IMPROBABLE * self._improbability(pose)
-
-        x, y, _ = max(structural.whole_shift(template, field, self._reach_px(view), _PEAKS_PER_TURN), key=likely)
-        return x, y
+    def _merit(self, peak: float, pose: Rigid3) -> float:
+        """Of a peak: its height, less what makes its pose improbable."""
+        return peak - _IMPROBABLE * self._improbability(pose)
 
     def _middle_shift(self, view: RenderedView, template: Float32Array, pose: Rigid3) -> tuple[int, int]:
         middle = _middle_px(template)
@@ -548,10 +553,8 @@ class Tracking:
                 if view.valid.mean() < _MIN_VALID:
                     continue
                 template = orientation_field(view.image, view.valid)
-                middle = _middle_px(template)
-                for x, y, peak in structural.whole_shift(template, field, self._reach_px(view), _PEAKS_PER_TURN):
-                    pose = _moved_sideways(view, middle, np.array([x, y], dtype=np.float64))
-                    candidates.append((peak - _IMPROBABLE * self._improbability(pose), pose))
+                for _, peak, pose in self._shifted(view, template, field, _PEAKS_PER_TURN):
+                    candidates.append((self._merit(peak, pose), pose))
         candidates.sort(key=lambda pair: -pair[0])
         return [pose for _, pose in candidates[:_CANDIDATES]]
 

@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 
 from ortholoc_edge.geometry import covariance as cov
-from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import BoolArray, FloatArray
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.rigid import Rigid3
+from ortholoc_edge.pose.adjust import linearised, moved
 
 try:
     import poselib
@@ -232,25 +232,11 @@ def _linearised(
 ) -> tuple[FloatArray, FloatArray]:
     """Residuals (N, 2) and their Jacobian (N, 2, 6 or 7) by camera centre, rotation vector (both in map axes,
     ``R = exp(d) R``) and log focal length."""
-    from_centre = points - pose.translation
-    x, y, z = (from_centre @ pose.rotation).T
-    u, v = x / z, y / z
-    residuals = np.column_stack([camera.fx * u + camera.cx, camera.fy * v + camera.cy]) - px
-    by_point = np.zeros((len(points), 2, 3))
-    by_point[:, 0, 0] = camera.fx / z
-    by_point[:, 0, 2] = -camera.fx * u / z
-    by_point[:, 1, 1] = camera.fy / z
-    by_point[:, 1, 2] = -camera.fy * v / z
-    by_map_point = by_point @ pose.rotation.T
-    # d(R^T exp(-d) (P - C)) = R^T skew(P - C) d
-    crosses = np.zeros((len(points), 3, 3))
-    crosses[:, 0, 1], crosses[:, 0, 2] = -from_centre[:, 2], from_centre[:, 1]
-    crosses[:, 1, 0], crosses[:, 1, 2] = from_centre[:, 2], -from_centre[:, 0]
-    crosses[:, 2, 0], crosses[:, 2, 1] = -from_centre[:, 1], from_centre[:, 0]
-    columns = [-by_map_point, by_map_point @ crosses]
+    residuals, jacobian = linearised(points, px, camera, pose)
     if free_focal:
-        columns.append(np.stack([camera.fx * u, camera.fy * v], axis=1)[:, :, None])
-    return residuals, np.concatenate(columns, axis=2)
+        from_axis = residuals + px - (camera.cx, camera.cy)
+        jacobian = np.concatenate([jacobian, from_axis[:, :, None]], axis=2)
+    return residuals, jacobian
 
 
 def _huber_scale(residuals: FloatArray, max_error_px: float) -> float:
@@ -291,13 +277,13 @@ def _levenberg_marquardt(
             step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), -gradient)
         except np.linalg.LinAlgError:
             break
-        moved = Rigid3(rotation.exp(step[3:6]) @ pose.rotation, pose.translation + step[:3])
+        stepped = moved(pose, step[:6])
         zoom = focal_scale * float(np.exp(np.clip(step[6], -0.5, 0.5))) if free_focal else focal_scale
-        new_residuals, new_jacobian = _linearised(points, px, _zoomed(camera, zoom), moved, free_focal)
+        new_residuals, new_jacobian = _linearised(points, px, _zoomed(camera, zoom), stepped, free_focal)
         new_cost = _huber_cost(new_residuals, scale)
         if np.isfinite(new_cost) and new_cost <= cost:
             done = cost - new_cost <= 1e-10 * cost
-            pose, focal_scale, cost = moved, zoom, new_cost
+            pose, focal_scale, cost = stepped, zoom, new_cost
             residuals, jacobian = new_residuals, new_jacobian
             damping = max(damping * 0.1, 1e-10)
             if done:
