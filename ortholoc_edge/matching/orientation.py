@@ -39,30 +39,39 @@ def orientation_field(image: ImageArray, valid: BoolArray | None = None) -> Floa
     """
     x = cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=3)
     y = cv2.Sobel(image, cv2.CV_32F, 0, 1, ksize=3)
+    field = np.empty((2, *image.shape), np.float32)
+    np.multiply(x, y, out=field[1])
+    field[1] += field[1]
+    np.square(x, out=x)
+    np.square(y, out=y)
+    np.subtract(x, y, out=field[0])
     # Not cv2.magnitude: it rounds by how its buffers lie in memory, and a replay must give the same bits.
-    strength = np.sqrt(x * x + y * y)
-    scale = 1.0 / np.maximum(strength, np.float32(1e-3))
+    strength = np.sqrt(np.add(x, y, out=x), out=x)
+    field /= np.maximum(strength, np.float32(1e-3), out=y)
     inner: Float32Array | None = None
     if valid is not None and not valid.all():
         inner = np.asarray(
             cv2.erode(valid.astype(np.uint8), _RIM, borderType=cv2.BORDER_REPLICATE), dtype=np.float32
         )
         strength *= inner
-        scale *= inner
-    field = np.empty((2, *image.shape), np.float32)
-    np.multiply(x, y, out=field[1])
-    field[1] *= 2.0 * scale
-    np.square(x, out=x)
-    np.square(y, out=y)
-    np.subtract(x, y, out=field[0])
-    field[0] *= scale
-    window = (_WINDOW_PX, _WINDOW_PX)
-    around = np.asarray(cv2.blur(cv2.blur(strength, window), window), dtype=np.float32)
-    around += _NOISE
+        field *= inner
+    around = _around(strength)
     for k in range(2):
         cv2.divide(cv2.GaussianBlur(field[k], (7, 7), _SMOOTHING_PX), around, dst=field[k])
     _subtract_local_mean(field, inner)
     return field
+
+
+def _around(strength: Float32Array) -> Float32Array:
+    """How strong edges are around each pixel, noise included."""
+    rows, columns = strength.shape
+    # A smooth thing: half of the pixels tell it.
+    small = cv2.resize(strength, (-(-columns // 2), -(-rows // 2)), interpolation=cv2.INTER_AREA)
+    window = (_WINDOW_PX // 2, _WINDOW_PX // 2)
+    small = cv2.blur(cv2.blur(small, window), window)
+    around = np.asarray(cv2.resize(small, (columns, rows), interpolation=cv2.INTER_LINEAR), dtype=np.float32)
+    around += _NOISE
+    return around
 
 
 def _subtract_local_mean(field: Float32Array, inner: Float32Array | None) -> None:

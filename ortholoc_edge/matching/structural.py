@@ -18,6 +18,8 @@ from ortholoc_edge.geometry.arrays import Float32Array, FloatArray
 
 _MIN_ENERGY: Final = 1e-9
 _DOUBT: Final = 0.01
+# Pixels that are multiplied at a time.
+_BAND_PX: Final = 49152
 # Shifts by one pixel, counted from (-1, -1), at which a patch is compared with itself: none, right, below, and along
 # either diagonal. Left and above are the same again, but for the patch's rim.
 _OWN_SHIFTS: Final = ((1, 1), (2, 1), (1, 2), (2, 2), (2, 0))
@@ -152,14 +154,20 @@ def _products(
 ) -> Float32Array:
     """(S, rows, columns): mean product over each cell with what lies (x, y) px from the corner of ``around``."""
     _, height, width = fixed.shape
-    size = width // cell, height // cell
-    volume = np.empty((len(shifts), size[1], size[0]), np.float32)
-    product = np.empty((height, width), np.float32)
-    for cells, (dx, dy) in zip(volume, shifts, strict=True):
-        moved = around[:, dy : dy + height, dx : dx + width]
-        cv2.multiply(fixed[0], moved[0], dst=product)
-        cv2.accumulateProduct(fixed[1], moved[1], product)
-        cv2.resize(product, size, dst=cells, interpolation=cv2.INTER_AREA)
+    volume = np.empty((len(shifts), height // cell, width // cell), np.float32)
+    # Some rows of cells at a time, so that all that is multiplied stays in the processor's cache.
+    band = max(_BAND_PX // (width * cell), 1) * cell
+    for top in range(0, height, band):
+        rows = slice(top, min(top + band, height))
+        count = rows.stop - rows.start
+        product = np.empty((count, width), np.float32)
+        size = width // cell, count // cell
+        part = volume[:, top // cell : top // cell + count // cell]
+        for cells, (dx, dy) in zip(part, shifts, strict=True):
+            moved = around[:, top + dy : top + dy + count, dx : dx + width]
+            cv2.multiply(fixed[0, rows], moved[0], dst=product)
+            cv2.accumulateProduct(fixed[1, rows], moved[1], product)
+            cv2.resize(product, size, dst=cells, interpolation=cv2.INTER_AREA)
     return volume
 
 
@@ -232,11 +240,14 @@ def _shifted_window(
 
 def _patches(cells: Float32Array, count: int, stride: int) -> Float32Array:
     """Sums over ``count`` x ``count`` neighbours along the last two axes, at every ``stride``-th of them."""
-    across = np.cumsum(cells, axis=-1, dtype=np.float64)
-    across[..., count:] -= across[..., :-count].copy()
-    total = np.cumsum(across[..., count - 1 :], axis=-2)
-    total[..., count:, :] -= total[..., :-count, :].copy()
-    return np.asarray(total[..., count - 1 :: stride, ::stride], dtype=np.float32)
+    rows, columns = (size - count + 1 for size in cells.shape[-2:])
+    across = cells[..., :columns:stride].copy()
+    for k in range(1, count):
+        across += cells[..., k : columns + k : stride]
+    total = across[..., :rows:stride, :].copy()
+    for k in range(1, count):
+        total += across[..., k : rows + k : stride, :]
+    return total
 
 
 def _peaks(

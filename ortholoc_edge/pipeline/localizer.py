@@ -241,7 +241,7 @@ class Localizer:
             found = self._track(query.result(), terrain, prior, outline, proceed, trace)
         finally:
             query.cancel()
-        if (found is None or not found.convincing) and not proceed():
+        if (found is None or not found.plausible) and not proceed():
             raise RejectedError(Reason.LATE, "the search ended before anything convinced")
         if found is None:
             raise RejectedError(Reason.FEW_MATCHES, "the map in the predicted view looks nothing like the frame")

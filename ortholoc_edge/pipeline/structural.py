@@ -46,7 +46,6 @@ class Level:
 class Tuning:
     """What docs/studies/structural.md settled, to be varied there.
 
-    ``render_again``: the map is drawn anew at each level, at the pose so far.
     ``repeat_below``: part of a middle level's matches that agree, below which it is gone through again.
     ``attitude``: the prior's attitude takes part in the pose that goes out.
     ``match_covariance``: a patch counts by how sharp its peak is, and not as all others.
@@ -55,7 +54,6 @@ class Tuning:
     """
 
     levels: tuple[Level, ...] = (Level(128, 6, 8, 6), Level(256, 3, 8, 6, 2), Level(512, 2, 16, 3))
-    render_again: bool = True
     repeat_below: float = 0.9
     attitude: bool = True
     match_covariance: bool = True
@@ -80,11 +78,11 @@ _LAST_INLIER_PX = 0.8
 # Shift of the whole view that is looked for, in sigmas of the prior, and its limits as parts of the long side.
 _REACH_SIGMAS = 3.5
 _MIN_REACH, _MAX_REACH = 0.08, 0.45
-# Matches that agree at the last level, their part of the patches in view, and of the matches at each level, that leave
-# other ways untried. Right tracks on the real flights have 162 and 0.45 or more, frames shown where they do not belong
-# 19 and 0.03 at most (docs/studies/structural.md, "Support").
+# Matches that agree at the last level, and their part of the patches in view: from the lower part on a search around
+# the same prior finds nothing better (676 frames, docs/studies/structural.md, "Support"); from the higher, if so many
+# of the matches agreed at each level, other priors need not be tried either.
 _CONVINCING_MATCHES = 60
-_CONVINCING_SUPPORT = 0.35
+_PLAUSIBLE_SUPPORT, _CONVINCING_SUPPORT = 0.15, 0.35
 _CONVINCING_BEFORE = 0.5
 # Share of a level's matches, below which going on is a waste: chance alone gives the second level a tenth.
 _HOPELESS = 0.2
@@ -100,13 +98,18 @@ _MAX_ZOOMS = 7
 _PEAKS_PER_TURN = 3
 _IMPROBABLE = 0.2
 _CANDIDATES = 6
+# Poses that the second level makes the same of: apart by these parts of the height, and by this turn.
+_ALIKE_HEIGHTS, _ALIKE_RAD = 0.015, math.radians(1.0)
+# Support at the level before the last that leaves the other starts untried.
+_PROMISING = 0.3
 # A rival: one of so many peaks of the whole view's correlation at the second level, of so much of the height of the
-# track's own, hardly less probable (squared sigmas), that ends elsewhere (part of the height above ground).
+# track's own, hardly less probable (squared sigmas), that ends elsewhere.
 _RIVAL_PEAKS = 5
 _RIVAL_PEAK = 0.6
 _RIVAL_LESS_PROBABLE = 16.0
 _OWN_PEAK_PX = 4.0
-_APART = 0.01
+# Part of the second level's matches that agree with the track, below which a rival is not followed further.
+_RIVAL_AGREE = 0.4
 # Of the last level's patches: independent samples (48 x 48 px, correlated over 3, shared with neighbours), and the
 # highest correlation that counts.
 _SAMPLES = 80.0
@@ -176,32 +179,6 @@ def _size(camera: Camera, long_px: int) -> tuple[int, int]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Track:
-    """What the levels came to.
-
-    Attributes:
-        estimate: at the frame's full size.
-        query_px: (M, 2) px of the frame without distortion; points_local: (M, 3).
-        support: part of the patches in view that agree with the pose.
-        convincing: whether other ways need not be tried.
-        second_view: drawn at the second level near this pose, and its field.
-        rival: inliers of the best track elsewhere, as a part of this one's.
-    """
-
-    estimate: PoseEstimate
-    query_px: FloatArray
-    points_local: FloatArray
-    support: float
-    convincing: bool
-    second_view: tuple[RenderedView, Float32Array]
-    rival: float = 0.0
-
-    @property
-    def inliers(self) -> int:
-        return int(np.count_nonzero(self.estimate.inliers))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Step:
     """One level's outcome: the view that was drawn and its field; matches (N) of level px and local points, how well
     they fit, how sure their places are, and which agree with the pose; and how many patches were in view."""
@@ -217,8 +194,51 @@ class _Step:
     looked_for: int
 
     @property
+    def pose(self) -> Rigid3:
+        return self.adjusted.local_from_camera
+
+    @property
+    def agree(self) -> int:
+        """How many matches agree with the pose."""
+        return int(np.count_nonzero(self.inliers))
+
+    @property
     def agreeing(self) -> float:
-        return float(self.inliers.mean()) if len(self.inliers) else 0.0
+        """Their part of the matches."""
+        return self.agree / max(len(self.inliers), 1)
+
+    @property
+    def support(self) -> float:
+        """Their part of the patches in view."""
+        return self.agree / max(self.looked_for, 1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """What the levels came to.
+
+    Attributes:
+        estimate: at the frame's full size.
+        query_px: (M, 2) px of the frame without distortion; points_local: (M, 3).
+        support: part of the patches in view that agree with the pose.
+        plausible: whether other ways need not be tried around the same prior.
+        convincing: whether they need not be tried anywhere.
+        second: the second level's outcome.
+        rival: inliers of the best track elsewhere, as a part of this one's.
+    """
+
+    estimate: PoseEstimate
+    query_px: FloatArray
+    points_local: FloatArray
+    support: float
+    plausible: bool
+    convincing: bool
+    second: _Step
+    rival: float = 0.0
+
+    @property
+    def inliers(self) -> int:
+        return int(np.count_nonzero(self.estimate.inliers))
 
 
 class Tracking:
@@ -265,37 +285,42 @@ class Tracking:
 
     def _best(self, proceed: Callable[[], bool]) -> Track | None:
         best = self._descend(self._predicted.local_from_camera, look_wide=True)
-        if best is not None and best.convincing:
+        if best is not None and best.plausible:
             return best
+        # The last level costs as much as all before it: only the best of the starts gets there.
+        approach: list[_Step] | None = None
+        seen: list[Rigid3] = []
         for start in self._search() if proceed() else []:
             if not proceed():
                 break
-            found = self._descend(start, look_wide=False)
-            if found is not None and (best is None or found.inliers > best.inliers):
-                best = found
-            if best is not None and best.convincing:
+            another = self._approach(start, seen)
+            if another is not None and (approach is None or another[-1].agree > approach[-1].agree):
+                approach = another
+            if approach is not None and approach[-1].support >= _PROMISING:
                 break
+        found = None if approach is None else self._arrive(approach)
+        if found is not None and (best is None or found.inliers > best.inliers):
+            return found
         return best
 
     def _elsewhere(self, best: Track) -> Track | None:
         """The best track that ends elsewhere: rows of trees or of panels fit one row further, too."""
-        found_pose, (view, template) = best.estimate.local_from_camera, best.second_view
-        field = self._query.fields[1]
-        peaks = self._shifted(view, template, field, _RIVAL_PEAKS)
+        found_pose, second = best.estimate.local_from_camera, best.second
+        peaks = self._shifted(second.view, second.template, self._query.fields[1], _RIVAL_PEAKS)
         own = max((peak for (x, y), peak, _ in peaks if math.hypot(x, y) <= _OWN_PEAK_PX), default=peaks[0][1])
         limit = self._improbability(found_pose) + _RIVAL_LESS_PROBABLE
         found: Track | None = None
+        seen = [found_pose]
         for (x, y), peak, start in peaks:
-            if math.hypot(x, y) <= _OWN_PEAK_PX or peak < _RIVAL_PEAK * own:
+            if math.hypot(x, y) <= _OWN_PEAK_PX or peak < _RIVAL_PEAK * own or self._improbability(start) > limit:
                 continue
-            if self._improbability(start) > limit:
+            approach = self._approach(start, seen)
+            if approach is None or approach[-1].agree < _RIVAL_AGREE * second.agree:
                 continue
-            rival = self._descend(start, look_wide=False)
-            if rival is None:
+            rival = self._arrive(approach)
+            if rival is None or self._alike(rival.estimate.local_from_camera, found_pose):
                 continue
-            apart = rival.estimate.local_from_camera.translation - found_pose.translation
-            if float(np.linalg.norm(apart)) > _APART * max(float(np.median(view.fall_m)), 1e-3):
-                found = rival if found is None or rival.inliers > found.inliers else found
+            found = rival if found is None or rival.inliers > found.inliers else found
         return found
 
     def _improbability(self, pose: Rigid3) -> float:
@@ -305,38 +330,48 @@ class Tracking:
 
     def _descend(self, pose: Rigid3, look_wide: bool) -> Track | None:
         """Through the levels. ``look_wide``: at the first the shift of the whole view is looked for before."""
-        steps: list[_Step] = []
-        drawn_at = pose
-        last = len(self._tuning.levels) - 1
-        for number in range(last + 1):
-            known = self._upright if number == last else self._predicted
-            passes = 2 if 0 < number < last else 1
-            while True:
-                step = self._level(number, drawn_at, pose, known, look_wide and number == 0)
-                if step is None:
-                    return None
-                pose = step.adjusted.local_from_camera
-                if self._tuning.render_again:
-                    drawn_at = pose
-                passes -= 1
-                if not passes or step.agreeing >= self._tuning.repeat_below:
-                    break
-            if number > 0 and step.agreeing < _HOPELESS:
-                return None
-            steps.append(step)
-        return self._track(steps)
+        approach = self._approach(pose, [], look_wide)
+        return None if approach is None else self._arrive(approach)
 
-    def _level(
-        self, number: int, drawn_at: Rigid3, pose: Rigid3, known: PoseMeasurement, look_wide: bool
-    ) -> _Step | None:
-        """Matches of one level, and the pose adjusted to them.
+    def _approach(self, pose: Rigid3, seen: list[Rigid3], look_wide: bool = False) -> list[_Step] | None:
+        """Through all levels but the last; None where that leads nowhere, or where the first leads to a place seen.
 
         Args:
-            drawn_at: pose that the map is drawn at; matches are looked for around where ``pose`` says.
+            seen: where the first level led others; its place is added.
         """
+        step = self._level(0, pose, self._predicted, look_wide)
+        if step is None or any(self._alike(step.pose, other) for other in seen):
+            return None
+        seen.append(step.pose)
+        steps = [step]
+        for number in range(1, len(self._tuning.levels) - 1):
+            step = self._level(number, step.pose, self._predicted)
+            if step is not None and step.agreeing < self._tuning.repeat_below:
+                step = self._level(number, step.pose, self._predicted)
+            if step is None or step.agreeing < _HOPELESS:
+                return None
+            steps.append(step)
+        return steps
+
+    def _alike(self, one: Rigid3, other: Rigid3) -> bool:
+        """Whether poses are so near that the second level makes the same of them."""
+        height_m = max(float(one.translation[2]) - self._terrain.lowest_m, 1e-3)
+        turn_rad = float(np.linalg.norm(rotation.log(one.rotation @ other.rotation.T)))
+        away_m = float(np.linalg.norm(one.translation - other.translation))
+        return turn_rad < _ALIKE_RAD and away_m < _ALIKE_HEIGHTS * height_m
+
+    def _arrive(self, approach: list[_Step]) -> Track | None:
+        """The last level."""
+        step = self._level(len(approach), approach[-1].pose, self._upright)
+        if step is None or step.agreeing < _HOPELESS:
+            return None
+        return self._track([*approach, step])
+
+    def _level(self, number: int, pose: Rigid3, known: PoseMeasurement, look_wide: bool = False) -> _Step | None:
+        """Matches of one level with the map drawn at a pose, and the pose adjusted to them."""
         level, camera, field = self._tuning.levels[number], self._query.cameras[number], self._query.fields[number]
         with self._trace.stage("view"):
-            view = render(self._terrain, camera, drawn_at)
+            view = render(self._terrain, camera, pose)
         if view.valid.mean() < _MIN_VALID:
             return None
         with self._trace.stage("map_features"):
@@ -345,8 +380,6 @@ class Tracking:
         with self._trace.stage("match"):
             if look_wide:
                 whole = self._likely_shift(view, template, field)
-            elif not self._tuning.render_again:
-                whole = self._middle_shift(view, template, pose)
             found = structural.correlate(
                 template,
                 field,
@@ -357,7 +390,7 @@ class Tracking:
                 origin=whole or (0, 0),
             )
         with self._trace.stage("pose"):
-            step = self._adjusted(number, view, found, template, known, pose, whole if look_wide else None)
+            step = self._adjusted(number, view, found, template, known, pose, whole)
             if step is None or not self._tuning.polish or number < len(self._tuning.levels) - 1:
                 return step
             return self._polished(view, found, known, step)
@@ -415,12 +448,6 @@ class Tracking:
     def _merit(self, peak: float, pose: Rigid3) -> float:
         """Of a peak: its height, less what makes its pose improbable."""
         return peak - _IMPROBABLE * self._improbability(pose)
-
-    def _middle_shift(self, view: RenderedView, template: Float32Array, pose: Rigid3) -> tuple[int, int]:
-        middle = _middle_px(template)
-        seen = view.camera.project(pose.inverse().apply(view.points_local(middle)))
-        x, y = np.round(np.nan_to_num(seen - middle))[0]
-        return int(x), int(y)
 
     def _reach_px(self, view: RenderedView) -> int:
         """How far the whole view may be shifted by what the prior does not know, px."""
@@ -498,7 +525,6 @@ class Tracking:
             return None
         scale = self._camera.width / camera.width, self._camera.height / camera.height
         errors = np.nan_to_num(np.linalg.norm(last.adjusted.residuals_px * scale, axis=1), nan=np.inf)
-        count = int(np.count_nonzero(last.inliers))
         estimate = PoseEstimate(
             last.adjusted.local_from_camera,
             self._camera,
@@ -507,19 +533,18 @@ class Tracking:
             errors,
             float(np.sqrt(np.mean(errors[last.inliers] ** 2))),
         )
-        support = count / max(last.looked_for, 1)
+        support = last.support
+        enough = last.agree >= _CONVINCING_MATCHES
+        plausible = enough and support >= _PLAUSIBLE_SUPPORT
         convincing = (
-            count >= _CONVINCING_MATCHES
-            and support >= _CONVINCING_SUPPORT
-            and all(step.agreeing >= _CONVINCING_BEFORE for step in steps)
+            enough and support >= _CONVINCING_SUPPORT and all(step.agreeing >= _CONVINCING_BEFORE for step in steps)
         )
-        second = steps[1].view, steps[1].template
-        return Track(estimate, resize_px(last.px, scale), last.points, support, convincing, second)
+        return Track(estimate, resize_px(last.px, scale), last.points, support, plausible, convincing, steps[1])
 
     def _covariance(self, step: _Step, camera: Camera) -> FloatArray | None:
         """(6, 6): of what was seen, together with the attitude that was known; None if that determines no pose."""
         inliers = step.inliers
-        if np.count_nonzero(inliers) < _MIN_MATCHES:
+        if step.agree < _MIN_MATCHES:
             return None
         side = max(camera.width, camera.height) / _CLUSTERS_ACROSS
         column, row = np.floor(step.px[inliers] / side).astype(np.intp).T
@@ -540,9 +565,9 @@ class Tracking:
         return np.asarray(full, dtype=np.float64)
 
     def _search(self) -> list[Rigid3]:
-        """Poses to start from, the most promising first: peaks of the whole view's correlation at the second level,
+        """Poses to start from, the most promising first: peaks of the whole view's correlation at the first level,
         over turns of the heading and heights, less what makes them improbable."""
-        camera, field = self._query.cameras[1], self._query.fields[1]
+        camera, field = self._query.cameras[0], self._query.fields[0]
         predicted = self._predicted.local_from_camera
         candidates: list[tuple[float, Rigid3]] = []
         with self._trace.stage("search"):
