@@ -316,7 +316,8 @@ class Figures(Struct, frozen=True, kw_only=True):
     """What a part came to on a set.
 
     ``recall`` and ``false_fixes`` are over all frames, errors and NEES over the fixes, times over all frames but the
-    first of each run, which pays for what is set up once. ``nees_per_dof`` is 1 if the covariance is honest.
+    first of each run, which pays for what is set up once. ``nees_per_dof`` is 1 if the covariance is honest;
+    ``unprotected`` counts the fixes beyond their own protection level.
     """
 
     part: str
@@ -332,6 +333,7 @@ class Figures(Struct, frozen=True, kw_only=True):
     false_fixes: int
     nees: metrics.Nees
     nees_per_dof: float | None
+    unprotected: int
     cpu_ms: metrics.Spread
     wall_ms: metrics.Spread
     wall_p99_over_median: float | None
@@ -366,6 +368,7 @@ def figures(part: str, name: str, matcher: str, takes: Sequence[Take]) -> Figure
         false_fixes=sum(take.is_false for take in takes),
         nees=nees,
         nees_per_dof=None if nees.mean is None else nees.mean / nees.dof,
+        unprotected=sum(e.unprotected for e in errors),
         cpu_ms=metrics.Spread.of([r.cpu_ms for r in timed]),
         wall_ms=wall,
         wall_p99_over_median=wall.p99 / wall.median if wall.p99 is not None and wall.median else None,

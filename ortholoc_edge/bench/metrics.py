@@ -91,11 +91,13 @@ class Summary(Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class PoseError:
-    """Distance of the camera centres (m), angle between the rotations (deg), and the NEES of both."""
+    """Distance of the camera centres (m), angle between the rotations (deg), the NEES of both, and whether the
+    horizontal or the vertical part of the distance is beyond the fix's protection level."""
 
     te_m: float
     re_deg: float
     nees: float
+    unprotected: bool = False
 
     @property
     def is_false(self) -> bool:
@@ -106,10 +108,12 @@ def pose_error(fix: Fix, truth: Rigid3) -> PoseError:
     """Error of a fix against the true ``map_from_camera``, in map units."""
     step = truth.translation - fix.map_from_camera.translation
     turn = rotation.log(truth.rotation @ fix.map_from_camera.rotation.T)
+    horizontal_m, vertical_m = fix.protection_m
     return PoseError(
         float(np.linalg.norm(step)),
         float(np.degrees(np.linalg.norm(turn))),
         mahalanobis_squared(np.concatenate([step, turn]), fix.covariance),
+        float(np.hypot(step[0], step[1])) > horizontal_m or abs(float(step[2])) > vertical_m,
     )
 
 

@@ -85,6 +85,20 @@ def rotated(covariance: FloatArray, rotation: npt.ArrayLike) -> FloatArray:
     return block @ covariance @ block.T
 
 
+# Standard deviations to a protection level: RTCA DO-229, appendix J, precision approach.
+_HORIZONTAL_SIGMAS, _VERTICAL_SIGMAS = 6.0, 5.33
+
+
+def protection_levels(covariance: FloatArray) -> tuple[float, float]:
+    """Horizontal and vertical bound, m, on the position error of a pose with a covariance (6, 6): what satellite
+    navigation calls its protection levels, with the horizontal sigma that of the worst direction.
+
+    They bound the error of a pose at the right place; that it is at the right place is what the gate is for.
+    """
+    worst = float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
+    return _HORIZONTAL_SIGMAS * float(np.sqrt(worst)), _VERTICAL_SIGMAS * float(np.sqrt(covariance[2, 2]))
+
+
 def mahalanobis_squared(difference: npt.ArrayLike, covariance: npt.ArrayLike) -> float:
     """``d^T C^-1 d`` of a difference (n,) under a covariance (n, n)."""
     d = np.asarray(difference, dtype=np.float64)

@@ -7,6 +7,7 @@ from enum import StrEnum
 
 from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.camera import Camera
+from ortholoc_edge.geometry.covariance import protection_levels
 from ortholoc_edge.geometry.rigid import Rigid3
 
 
@@ -80,6 +81,11 @@ class Fix:
     focal_sigma_px: float | None = None
     timings_ms: dict[str, float] = field(default_factory=dict)
     stored_features: bool = False
+
+    @property
+    def protection_m(self) -> tuple[float, float]:
+        """Horizontal and vertical protection level: `covariance.protection_levels`."""
+        return protection_levels(self.covariance)
 
 
 Outcome = Fix | Rejected

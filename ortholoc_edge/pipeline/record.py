@@ -27,6 +27,7 @@ def outcome_record(outcome: Outcome) -> dict[str, Any]:
         "position_map_m": pose.translation.tolist(),
         "quaternion_map_from_camera_wxyz": rotation.to_quaternion(pose.rotation).tolist(),
         "covariance": outcome.covariance.tolist(),
+        "protection_m": list(outcome.protection_m),
         "quality": outcome.quality,
         "matches": outcome.matches,
         "inliers": outcome.inliers,

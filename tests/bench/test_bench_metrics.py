@@ -57,6 +57,17 @@ def test_position_error_is_between_centres_whatever_the_rotation():
     assert metrics.pose_error(fix_at(away(truth, 0.0, 30.0)), truth).te_m == 0.0
 
 
+@pytest.mark.parametrize(
+    ("step", "unprotected"),
+    [((5.9, 0, 0), False), ((4.3, 4.3, 0), True), ((0, 0, -10.6), False), ((0, 0, -10.7), True)],
+)
+def test_an_error_beyond_the_protection_level_counts(step, unprotected):
+    """Six sigma horizontally, 5.33 vertically, of 1 and 2 m."""
+    truth = Rigid3(np.eye(3), (10.0, 20.0, 30.0))
+    error = metrics.pose_error(fix_at(Rigid3(np.eye(3), truth.translation + np.array(step))), truth)
+    assert error.unprotected is unprotected
+
+
 @given(vectors(3.0), vectors(0.02))
 def test_nees_is_of_the_stated_error(step, turn):
     estimate = Rigid3(rotation.exp([0.1, 0.2, 0.3]), (5.0, 6.0, 7.0))

@@ -156,3 +156,13 @@ def test_rotated_known_answer():
 
 def test_mahalanobis_known_answer():
     assert cov.mahalanobis_squared([2.0, 3.0], np.diag([4.0, 1.0])) == pytest.approx(10.0)
+
+
+def test_protection_levels_take_the_worst_horizontal_direction():
+    """Turned by 30 degrees, so that neither axis shows it."""
+    turn = rotation.from_euler(0.0, 0.0, np.radians(30.0))
+    covariance = np.eye(6)
+    covariance[:3, :3] = turn @ np.diag([4.0, 0.25, 9.0]) @ turn.T
+    horizontal_m, vertical_m = cov.protection_levels(covariance)
+    assert horizontal_m == pytest.approx(6.0 * 2.0)
+    assert vertical_m == pytest.approx(5.33 * 3.0)

@@ -29,6 +29,7 @@ def test_a_fix_survives_json():
     assert record["position_map_m"] == [500_000.125, 5_300_000.5, 321.0]
     assert np.allclose(rotation.from_quaternion(record["quaternion_map_from_camera_wxyz"]), turn)
     assert np.allclose(record["covariance"], made.covariance)
+    assert record["protection_m"] == list(made.protection_m)
     assert (record["matches"], record["inliers"]) == (200, 160)
     assert record["adhop_accepted"] is None
     assert record["focal_px"] == pytest.approx(200.0)
