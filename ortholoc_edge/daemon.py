@@ -158,7 +158,7 @@ class Daemon:
             # In every life of the program another value, or the autopilot would not notice the restart.
             first_reset_counter = self._clock.now_ns() // _S
             tracker = Tracker(self._georeference, self._body_from_camera, config.tracker, first_reset_counter)
-            self._navigator = Navigator(localizer, tracker)
+            self._navigator = Navigator(localizer, tracker, config.timing.budget_ms)
             self._link = AutopilotLink(config.link, self._clock)
             self._bus = resources.enter_context(closing(Bus(config.bus))) if config.bus.enabled else None
             self._recorder = (
@@ -188,6 +188,7 @@ class Daemon:
         return {
             **self._counts,
             "frames_replaced": self._slot.replaced,
+            "rung": self._navigator.ladder.rung,
             "map_files_damaged": len(self._store.damaged),
             "log_dropped": 0 if self._recorder is None else self._recorder.dropped,
             "bus_dropped": 0 if self._bus is None else self._bus.dropped,

@@ -34,7 +34,8 @@ from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.localizer import Localizer, LocalizerOptions
 from ortholoc_edge.pipeline.outcome import Fix
 from ortholoc_edge.pipeline.render import RenderedView, Terrain, render
-from ortholoc_edge.pipeline.structural import TUNING, Level, Tuning
+from ortholoc_edge.pipeline.structural import LADDER, TUNING, Level, Tuning
+from ortholoc_edge.pose.adjust import PoseMeasurement
 from ortholoc_edge.tiles.build import PackOptions, build_pack
 from ortholoc_edge.tiles.store import MapStore
 
@@ -67,10 +68,35 @@ def render_plane(terrain: Terrain, camera: Camera, pose: Rigid3) -> RenderedView
     return Plane(flat.image, flat.valid, camera, pose, flat.fall_m)
 
 
+def level_drawn_once(
+    self: Any, number: int, pose: Rigid3, known: PoseMeasurement, look_wide: bool = False
+) -> Any:
+    """`Tracking._level` with the view drawn where a descent began, its matches looked for around where the pose so far
+    puts the view's middle."""
+    if number == 0:
+        self.drawn_at = pose
+    level, camera, field = self._tuning.levels[number], self._query.cameras[number], self._query.fields[number]
+    view = structural.render(self._terrain, camera, self.drawn_at)
+    if view.valid.mean() < 0.1:
+        return None
+    template = structural.orientation_field(view.image, view.valid)
+    middle = structural._middle_px(template)
+    seen = camera.project(pose.inverse().apply(view.points_local(middle)))
+    origin = tuple(int(x) for x in np.round(np.nan_to_num(seen - middle))[0])
+    whole = self._likely_shift(view, template, field) if look_wide else None
+    found = structural.structural.correlate(
+        template, field, radius=level.radius_px, cell=level.cell_px, patch_cells=level.patch_cells,
+        stride=level.stride, origin=whole or origin,
+    )
+    step = self._adjusted(number, view, found, template, known, pose, whole)
+    last = len(self._tuning.levels) - 1
+    return step if step is None or number < last else self._polished(view, found, known, step)
+
+
 def variants() -> Iterator[Variant]:
     yield Variant("as it flies")
     yield Variant("plane homography instead of rendering", patches=((structural, "render", render_plane),))
-    yield Variant("drawn once, not again at each level", replace(TUNING, render_again=False))
+    yield Variant("drawn once, not again at each level", patches=((structural.Tracking, "_level", level_drawn_once),))
     yield Variant("no second pass of the middle level", replace(TUNING, repeat_below=0.0))
     yield Variant("attitude takes no part in the last pose", replace(TUNING, attitude=False))
     yield Variant("all patches count alike", replace(TUNING, match_covariance=False, sigma_px=0.3))
@@ -81,6 +107,8 @@ def variants() -> Iterator[Variant]:
     a, b, c = TUNING.levels
     yield Variant("two levels, 128 and 256 px", replace(TUNING, levels=(a, b)))
     yield Variant("last level's patches 80 px", replace(TUNING, levels=(a, b, Level(512, 2, 16, 5))))
+    yield Variant("last level 384 px", LADDER[1])
+    yield Variant("last level 256 px", LADDER[2])
     yield Variant("fourth level, 1024 px", replace(TUNING, levels=(a, b, c, Level(1024, 2, 16, 3))))
     yield Variant("field smoothed by 2 px", patches=((orientation, "_SMOOTHING_PX", 2.0),))
 
@@ -142,7 +170,7 @@ def measure(
     ground_m = store.ground_near(truth.translation[:2])
     assert ground_m is not None, record.name
     prior = noisy_prior(truth, float(truth.translation[2]) - ground_m, NOISE, np.random.default_rng([index, draw]))
-    localizer = Localizer(record.camera, store, Structural(), LocalizerOptions(), tuning)
+    localizer = Localizer(record.camera, store, Structural(), LocalizerOptions(), [tuning])
     frame = Frame(0, record.image(), record.name)
     localizer.localize(frame, prior)  # once, so that the map is decoded: what is compared is the matching
     start = time.process_time()

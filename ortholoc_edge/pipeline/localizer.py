@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal
@@ -109,8 +109,12 @@ class Localizer:
         store: MapStore,
         matcher: AnyMatcher,
         options: LocalizerOptions,
-        tuning: structural.Tuning = structural.TUNING,
+        ladder: Sequence[structural.Tuning] = structural.LADDER,
     ) -> None:
+        """
+        Args:
+            ladder: of structural matching: what `localize` may be told to do with, full detail first.
+        """
         self.camera = camera
         self._acquire = matcher.acquire if isinstance(matcher, Structural) else matcher
         if options.calibrate and self._acquire is None:
@@ -119,12 +123,11 @@ class Localizer:
                 "xfeat"
             )
         tracks = isinstance(matcher, Structural) and not options.calibrate
-        self._tracking = structural.QueryMaker(camera, tuning) if tracks else None
-        self._tuning = tuning
+        self._tracking = [structural.QueryMaker(camera, tuning) for tuning in ladder] if tracks else []
         self._store = store
         self._options = options
         self._max_error_px = pnp.threshold_px(camera)
-        working_px = tuning.levels[-1].long_px if self._acquire is None else self._acquire.working_px
+        working_px = ladder[0].levels[-1].long_px if self._acquire is None else self._acquire.working_px
         scale = min(1.0, working_px / max(camera.width, camera.height))
         # The size at which the matcher sees the frame; views of the map are drawn at the same size.
         self._working = camera.pinhole().resized(
@@ -167,8 +170,8 @@ class Localizer:
         """
         # Noise, because of an even picture no matcher asks its network.
         picture = np.random.default_rng(0).integers(0, 256, (self.camera.height, self.camera.width), dtype=np.uint8)
-        if self._tracking is not None:
-            self._tracking.fields(picture)
+        for tracking in self._tracking:
+            tracking.fields(picture)
         if self._acquire is not None:
             self._acquire.extract(picture)
 
@@ -178,32 +181,44 @@ class Localizer:
         assert self._acquire is not None, "a localizer without a matcher of features needs none"
         return self._acquire
 
+    @property
+    def rungs(self) -> int:
+        """In how many ways, of less and less detail, a frame can be localized."""
+        return max(len(self._tracking), 1)
+
     def localize(
-        self, frame: Frame, prior: PosePrior | RegionPrior, proceed: Callable[[], bool] = lambda: True
+        self,
+        frame: Frame,
+        prior: PosePrior | RegionPrior,
+        proceed: Callable[[], bool] = lambda: True,
+        rung: int = 0,
     ) -> Outcome:
         """The frame's pose, or why there is none.
 
         Args:
             proceed: asked before each further hypothesis of a wide prior; False ends the search as LATE.
+            rung: of the ladder, 0 to ``rungs - 1``; 0 is full detail.
         Raises: ModelError if the matcher itself fails.
         """
         trace = Trace()
         try:
-            return self._localize(frame, prior, proceed, trace)
+            return self._localize(frame, prior, proceed, rung, trace)
         except RejectedError as stop:
             return Rejected(frame.stamp_ns, stop.reason, stop.detail, stop.measured, stop.limit, trace.timings_ms())
         except WindowTooLargeError as error:
             return Rejected(frame.stamp_ns, Reason.PRIOR_TOO_WIDE, str(error), timings_ms=trace.timings_ms())
 
-    def _localize(self, frame: Frame, prior: PosePrior | RegionPrior, proceed: Callable[[], bool], trace: Trace) -> Fix:
+    def _localize(
+        self, frame: Frame, prior: PosePrior | RegionPrior, proceed: Callable[[], bool], rung: int, trace: Trace
+    ) -> Fix:
         grey = self._checked_grey(frame)
         only_stored = self._options.precomputed_features == "require"
-        if self._tracking is not None and not only_stored:
+        if self._tracking and not only_stored:
             if not isinstance(prior, PosePrior):
                 refused = RejectedError(Reason.NO_PRIOR, "structural matching needs a predicted pose")
             else:
                 try:
-                    return self._by_structure(self._tracking, frame, grey, prior, proceed, trace)
+                    return self._by_structure(self._tracking[rung], frame, grey, prior, proceed, trace)
                 except RejectedError as error:
                     refused = error
             if self._acquire is None or not proceed():
@@ -238,7 +253,7 @@ class Localizer:
                 terrain = Terrain.of(window, precondition.grey_map(window), local)
             if terrain is None:
                 raise RejectedError(Reason.MAP_NODATA, "the surface model has no data under the predicted view")
-            found = self._track(query.result(), terrain, prior, outline, proceed, trace)
+            found = self._track(query.result(), tracking.tuning, terrain, prior, outline, proceed, trace)
         finally:
             query.cancel()
         if (found is None or not found.plausible) and not proceed():
@@ -261,6 +276,7 @@ class Localizer:
     def _track(
         self,
         query: structural.QueryFields,
+        tuning: structural.Tuning,
         terrain: Terrain,
         prior: PosePrior,
         outline: FloatArray,
@@ -268,13 +284,13 @@ class Localizer:
         trace: Trace,
     ) -> structural.Track | None:
         """From the prior, and if that does not convince from narrower ones that cover it."""
-        best = structural.Tracking(query, terrain, prior, self.camera, trace, self._tuning).run(proceed)
+        best = structural.Tracking(query, terrain, prior, self.camera, trace, tuning).run(proceed)
         if best is not None and best.convincing:
             return best
         for hypothesis in hypotheses(prior, float(np.ptp(outline, axis=0).min())) or []:
             if hypothesis is prior or not proceed():
                 break
-            found = structural.Tracking(query, terrain, hypothesis, self.camera, trace, self._tuning).run(proceed)
+            found = structural.Tracking(query, terrain, hypothesis, self.camera, trace, tuning).run(proceed)
             if found is not None and (best is None or found.inliers > best.inliers):
                 best = found
             if best is not None and best.convincing:

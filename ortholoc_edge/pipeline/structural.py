@@ -62,6 +62,12 @@ class Tuning:
 
 
 TUNING = Tuning()
+# From full detail to what a throttled processor can still do (docs/studies/structural.md: "384 px", "256 px").
+LADDER = (
+    TUNING,
+    replace(TUNING, levels=(*TUNING.levels[:2], Level(384, 2, 12, 3))),
+    replace(TUNING, levels=(TUNING.levels[0], Level(256, 3, 8, 3))),
+)
 # Of a patch, below which its peak is chance.
 _MIN_SCORE = 0.2
 # Standard deviation of the whole picture's shift, px of the level.
@@ -140,6 +146,7 @@ class QueryMaker:
     """Brings frames of one camera to the levels."""
 
     def __init__(self, camera: Camera, tuning: Tuning = TUNING) -> None:
+        self.tuning = tuning
         pinhole = camera.pinhole()
         self._cameras = tuple(pinhole.resized(*_size(camera, level.long_px)) for level in tuning.levels)
         self._undistortion: tuple[np.ndarray, np.ndarray] | None = None
