@@ -1,12 +1,7 @@
-"""A Cloud Optimized GeoTIFF held in memory: its levels, its blocks, and which of them are damaged.
-
-Decoded blocks live in GDAL's block cache. GDAL has one per process, bounded by one figure, with its own least
-recently used order; a cache of ours on top would hold the same pixels twice.
-"""
+"""A Cloud Optimized GeoTIFF held in memory: its levels, its blocks, and which of them are damaged."""
 
 from __future__ import annotations
 
-import ctypes
 import threading
 import warnings
 import zlib
@@ -31,16 +26,12 @@ from ortholoc_edge.geometry.grid import RasterGrid
 
 BLOCK_PX = 512
 
-# An open level that was read from holds buffers of its own besides GDAL's cache: 1.0 MB of a DOP, 1.7 MB of a DSM
-# (measured). A view lies in at most 4 tiles of either, mostly in one or two; from 2 km above ground it takes in a
-# dozen of each, and with fewer handles than that every read would open them all again. Low above ground `settle` keeps
-# them few.
-MAX_HANDLES = 28
+# An open level that was read from holds buffers of its own, 1.0 MB of a DOP, 1.7 MB of a DSM, and opening one takes
+# 0.6 ms (measured). Few do: decoded blocks are kept elsewhere, and those of a tile are read in turn.
+MAX_HANDLES = 4
 
 # Of a pixel: what the sums of coordinates of millions of metres may be off.
 _PLACE_SLACK_PX = 1e-3
-
-_malloc_trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
 
 
 class UndecodableError(MapError):
@@ -74,9 +65,8 @@ class Handles:
     def __init__(self, limit: int = MAX_HANDLES) -> None:
         self.lock = threading.RLock()
         self._limit = limit
-        # By COG and level: the dataset, and the turn it was used in last. Used longest ago first.
-        self._open: OrderedDict[tuple[int, int], tuple[Any, int]] = OrderedDict()
-        self._turn = 0
+        # By COG and level; used longest ago first.
+        self._open: OrderedDict[tuple[int, int], Any] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self._open)
@@ -84,38 +74,19 @@ class Handles:
     def get(self, cog: Cog, level: int) -> Any:
         """A dataset of one level; to be used under ``lock`` only. Raises: MapError, UndecodableError."""
         key = id(cog), level
-        if key in self._open:
-            dataset = self._open[key][0]
-        else:
+        if key not in self._open:
             dataset = cog.open_level(level)
             if len(self._open) >= self._limit:
-                self._close_oldest()
-                _give_back()
-        self._open[key] = dataset, self._turn
+                self._open.popitem(last=False)[1].close()
+            self._open[key] = dataset
         self._open.move_to_end(key)
-        return dataset
-
-    def settle(self) -> None:
-        """End a turn, as one frame's reads are: close what neither it nor the one before used.
-
-        Two, since frames in turn may read another level, or just beyond a tile's border.
-        """
-        with self.lock:
-            count = len(self._open)
-            while self._open and next(iter(self._open.values()))[1] < self._turn - 1:
-                self._close_oldest()
-            if len(self._open) < count:
-                _give_back()
-            self._turn += 1
+        return self._open[key]
 
     def forget(self, cog: Cog) -> None:
         """Close what is open of a COG."""
         with self.lock:
             for key in [key for key in self._open if key[0] == id(cog)]:
-                self._open.pop(key)[0].close()
-
-    def _close_oldest(self) -> None:
-        self._open.popitem(last=False)[1][0].close()
+                self._open.pop(key).close()
 
 
 class Cog:
@@ -217,14 +188,17 @@ class Cog:
         for level, grid in self.grids.items():
             yield from touched(level, PixelWindow(0, 0, grid.width, grid.height))
 
+    def window_of(self, block: Block) -> PixelWindow:
+        """A block's pixels: those at the right and lower edge are cropped."""
+        grid = self.grids[block.level]
+        return within(block, PixelWindow(0, 0, grid.width, grid.height))
+
     def undecodable(self) -> list[Block]:
         """Blocks that GDAL cannot decode."""
         bad = []
         for block in self.blocks():
-            grid = self.grids[block.level]
             try:
-                window = within(block, PixelWindow(0, 0, grid.width, grid.height))
-                self._read(block.level, window, with_mask=True)
+                self._read(block.level, self.window_of(block), with_mask=True)
             except UndecodableError:
                 bad.append(block)
         return bad
@@ -313,18 +287,18 @@ class Cog:
         return bands, mask
 
 
-def touched(level: int, window: PixelWindow) -> Iterator[Block]:
-    """Blocks that a window of a level has pixels of."""
-    for row in range(window.row // BLOCK_PX, (window.row + window.height - 1) // BLOCK_PX + 1):
-        for column in range(window.column // BLOCK_PX, (window.column + window.width - 1) // BLOCK_PX + 1):
+def touched(level: int, window: PixelWindow, side: int = BLOCK_PX) -> Iterator[Block]:
+    """Blocks, of ``side`` pixels, that a window of a level has pixels of."""
+    for row in range(window.row // side, (window.row + window.height - 1) // side + 1):
+        for column in range(window.column // side, (window.column + window.width - 1) // side + 1):
             yield Block(level, column, row)
 
 
-def within(block: Block, window: PixelWindow) -> PixelWindow:
-    """The part of a window that lies in a block that it touches."""
-    column, row = max(block.column * BLOCK_PX, window.column), max(block.row * BLOCK_PX, window.row)
-    right = min((block.column + 1) * BLOCK_PX, window.column + window.width)
-    lower = min((block.row + 1) * BLOCK_PX, window.row + window.height)
+def within(block: Block, window: PixelWindow, side: int = BLOCK_PX) -> PixelWindow:
+    """The part of a window that lies in a block, of ``side`` pixels, that it touches."""
+    column, row = max(block.column * side, window.column), max(block.row * side, window.row)
+    right = min((block.column + 1) * side, window.column + window.width)
+    lower = min((block.row + 1) * side, window.row + window.height)
     return PixelWindow(column, row, right - column, lower - row)
 
 
@@ -380,15 +354,6 @@ def set_block_cache(limit_bytes: int) -> None:
     """Bound GDAL's block cache of the whole process."""
     with rasterio.Env():
         set_gdal_config("GDAL_CACHEMAX", limit_bytes)
-
-
-def _give_back() -> None:
-    """Let the C library return freed memory to the system, where it can (glibc).
-
-    GDAL allocates blocks of 0.3-1 MB, and glibc keeps what was freed of them: 40 MB over a flight (measured). 0.3 ms.
-    """
-    if _malloc_trim is not None:
-        _malloc_trim(0)
 
 
 def _same_place(found: RasterGrid, wanted: RasterGrid) -> bool:
