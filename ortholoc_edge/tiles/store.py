@@ -27,7 +27,9 @@ from ortholoc_edge.tiles.window import ColourWindow, MapWindow, SurfaceWindow
 
 logger = logging.getLogger(__name__)
 
-CACHE_BYTES = 20 * 2**20
+# A view of 768 x 576 px and its heights are 4 to 6 MiB of blocks, stored or averaged: with less it pushes itself out,
+# and with more a flight decodes no less (measured).
+CACHE_BYTES = 8 * 2**20
 # GDAL's own cache, of the whole process: a block is read from it once and as a whole, so one is enough.
 _GDAL_CACHE_BYTES = 2**20
 # Of compressed files: about 190 km2 at 4 MB per km2.
