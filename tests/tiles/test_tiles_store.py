@@ -337,7 +337,7 @@ def test_open_handles_are_bounded(pack, monkeypatch):
 @pytest.mark.parametrize("gsd_m", [0.25, 0.5, 1.0, 2.0, 4.0])
 def test_what_was_seen_before_is_not_decoded_again(pack, decoded, gsd_m):
     """Of a level that is stored or averaged; also not what only the frame before the last saw."""
-    reach = 60 * gsd_m / 0.25
+    reach = min(240 * gsd_m, 120.0)
     first, other = ((x, SOUTH + 20, x + reach, SOUTH + 20 + reach) for x in (WEST + 10, WEST + 10 + 0.6 * reach))
     with MapStore(pack) as opened:
         windows = [opened.read(bounds, gsd_m) for bounds in (first, other)]
