@@ -79,13 +79,13 @@ class MapOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Which area pack, and how much memory it may take.
 
     ``memory_mb``: limit of its compressed files, which all are held; a larger pack is refused at the start.
-    ``cache_mb``: limit of decoded blocks besides.
+    ``cache_mb``: limit of decoded blocks, in grey and heights, besides; one view and its next take 4 to 6.
     ``require_intact``: refuse a pack with missing or damaged files instead of flying with holes in the map.
     ``public_key``: PEM file; refuse a pack that this key did not sign. None: a signature is not looked for.
     """
 
     pack: str
-    cache_mb: Annotated[int, Meta(ge=1)] = 20
+    cache_mb: Annotated[int, Meta(ge=1)] = 8
     memory_mb: Annotated[int, Meta(ge=1)] = 768
     require_intact: bool = False
     public_key: Annotated[str, Meta(min_length=1)] | None = None

@@ -107,10 +107,11 @@ def map_in_view(store: MapStore, camera: Camera, map_from_camera: Rigid3, ground
     outline = footprint(camera, map_from_camera, ground_m)
     margin = _MARGIN_PART * float(np.ptp(outline, axis=0).max())
     (west, south), (east, north) = outline.min(axis=0) - margin, outline.max(axis=0) + margin
-    window = store.read((west, south, east, north), max(height_m / camera.focal_px, (east - west) / 4096))
-    if window is None or not np.isfinite(window.dsm).any():
+    picture = store.read_colour((west, south, east, north), max(height_m / camera.focal_px, (east - west) / 4096))
+    surface = None if picture is None else store.read_surface(picture.grid, 2.0 * picture.grid.gsd_m)
+    if picture is None or surface is None or not np.isfinite(surface.dsm).any():
         return black
-    heights = np.where(np.isfinite(window.dsm), window.dsm, np.float32(np.nanmedian(window.dsm)))
+    heights = np.where(np.isfinite(surface.dsm), surface.dsm, np.float32(np.nanmedian(surface.dsm)))
     u, v = np.meshgrid(np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64))
     rays = camera.unproject(np.stack([u, v], axis=-1).reshape(-1, 2)) @ map_from_camera.rotation.T
     down = -rays[:, 2] / np.linalg.norm(rays, axis=1)
@@ -124,10 +125,9 @@ def map_in_view(store: MapStore, camera: Camera, map_from_camera: Rigid3, ground
         return px.astype(np.float32).reshape(camera.height, camera.width, 2)
 
     for _ in range(_LOOKS):
-        at = pixels(window.dsm_grid)
+        at = pixels(surface.dsm_grid)
         met = cv2.remap(heights, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         fall = float(map_from_camera.translation[2]) - np.asarray(met, dtype=np.float64).reshape(-1)
-    at = pixels(window.dop_grid)
-    dop = np.where(window.dop_valid[..., None], window.dop, np.uint8(0))
-    drawn = cv2.remap(dop, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    at = pixels(picture.grid)
+    drawn = cv2.remap(picture.rgb, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     return np.asarray(drawn, dtype=np.uint8)

@@ -84,13 +84,13 @@ def track(store: MapStore, tracks: Sequence[Track], caption: str) -> ImageArray:
     if not (east > west and north > south):
         raise OrtholocError("the track does not lie on the pack; nothing to draw")
     gsd_m = max(east - west, north - south) / _MAX_TRACK_PX
-    window = store.read((west, south, east, north), gsd_m)
+    window = store.read_colour((west, south, east, north), gsd_m)
     if window is None:
         raise OrtholocError("the track does not lie on the pack; nothing to draw")
-    scale = min(1.0, _MAX_TRACK_PX / max(window.dop.shape[:2]))
-    size = (round(window.dop.shape[1] * scale), round(window.dop.shape[0] * scale))
-    canvas = np.asarray(cv2.resize(window.dop, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    grid = window.dop_grid.resized(*size)
+    scale = min(1.0, _MAX_TRACK_PX / max(window.rgb.shape[:2]))
+    size = (round(window.grid.width * scale), round(window.grid.height * scale))
+    canvas = np.asarray(cv2.resize(window.rgb, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    grid = window.grid.resized(*size)
     for one in tracks:
         px = grid.px_from_map(one.xy_map)
         if one.joined and len(px) > 1:

@@ -26,7 +26,6 @@ from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, I
 from ortholoc_edge.matching.types import AnyMatcher
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
 from ortholoc_edge.tiles.build import PackOptions, Workers, build_pack
-from ortholoc_edge.tiles.cog import set_block_cache
 from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.store import CACHE_BYTES, MapStore
 
@@ -315,10 +314,7 @@ def measure_reads(
                 tile = lattice.grid(tiles[int(rng.choice(len(tiles), p=weights / weights.sum()))].box).bounds
                 at = rng.uniform(tile[:2], tile[2:])
                 bounds = (at[0] - half[0], at[1] - half[1], at[0] + half[0], at[1] + half[1])
-                # The cache gives way to a limit of nothing.
-                set_block_cache(0)
-                store.read(bounds, grid.gsd_m)
-                set_block_cache(cache_bytes)
+                store.forget_decoded()
                 cold.append(_timed_ms(store, bounds, grid.gsd_m))
                 warm.append(_timed_ms(store, bounds, grid.gsd_m))
             yield ReadRow(

@@ -90,13 +90,12 @@ class _MapScene:
     """A scene with its orthophoto.
 
     Attributes:
-        window, dop_grey: as read, and its orthophoto in grey.
+        window: as read.
         views: pictures of it to match against.
     """
 
     scene: Scene
     window: MapWindow
-    dop_grey: ImageArray
     views: list[ReferenceView]
 
 
@@ -250,7 +249,7 @@ class Localizer:
                 gsd_m = self._distance_to_ground(prior, ground_m) / tracking.finest.focal_px
                 window = self._read(search_bounds(outline, prior, ground_m, self._options.search_sigmas), gsd_m)
                 local = self._local_frame(window, ground_m)
-                terrain = Terrain.of(window, precondition.grey_map(window), local)
+                terrain = Terrain.of(window, local)
             if terrain is None:
                 raise RejectedError(Reason.MAP_NODATA, "the surface model has no data under the predicted view")
             found = self._track(query.result(), tracking.tuning, terrain, prior, outline, proceed, trace)
@@ -432,30 +431,28 @@ class Localizer:
             ground_m, outline = ground or self._predicted_ground(prior)
             gsd_m = self._distance_to_ground(prior, ground_m) / self._working.focal_px
             window = self._read(search_bounds(outline, prior, ground_m, self._options.search_sigmas), gsd_m)
-            dop_grey = precondition.grey_map(window)
         with trace.stage("view"):
             local = self._local_frame(window, ground_m)
             plane = precondition.ground_plane(window, local, outline)
             if plane is None:
                 raise RejectedError(Reason.MAP_NODATA, "the surface model has no data under the predicted view")
-            view = precondition.predicted_view(window, dop_grey, local, plane, self._working, prior, widen)
+            view = precondition.predicted_view(window, local, plane, self._working, prior, widen)
             if not view.valid.any():
                 raise RejectedError(Reason.MAP_NODATA, "the orthophoto has no data in the predicted view")
         scene = Scene(window, local, ground_m, view.working_from_dop, view.max_shift_px)
-        return _MapScene(scene, window, dop_grey, [view])
+        return _MapScene(scene, window, [view])
 
     def _scene_of_region(self, prior: RegionPrior, trace: Trace) -> _MapScene:
         with trace.stage("map_window"):
             west, south, east, north = prior.bounds_map
             window = self._read(prior.bounds_map, max(east - west, north - south) / self.matcher.working_px)
-            dop_grey = precondition.grey_map(window)
             known = window.dsm[np.isfinite(window.dsm)]
             if not len(known):
                 raise RejectedError(Reason.MAP_NODATA, "the surface model has no data in the region")
             ground_m = float(np.median(known))
         with trace.stage("view"):
-            views = precondition.quarter_turns(window, dop_grey)
-        return _MapScene(Scene(window, self._local_frame(window, ground_m), ground_m), window, dop_grey, views)
+            views = precondition.quarter_turns(window)
+        return _MapScene(Scene(window, self._local_frame(window, ground_m), ground_m), window, views)
 
     def _predicted_ground(self, prior: PosePrior) -> tuple[float, FloatArray]:
         """Typical height of the surface in the predicted view, and the view's footprint (K, 2) on it."""
@@ -610,7 +607,7 @@ class Localizer:
             ]
         )
         view = precondition.warped(
-            scene.dop_grey, scene.window.dop_valid, shrink @ fitted[0], working.width, working.height
+            scene.window.dop_grey, scene.window.dop_valid, shrink @ fitted[0], working.width, working.height
         )
         matches = self.matcher.match(query, self.matcher.extract(view.image, view.valid))
         second = self._solved(matches, view, scene.scene)

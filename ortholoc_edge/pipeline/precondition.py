@@ -64,11 +64,6 @@ class ReferenceView:
         return homography.warp_points(np.linalg.inv(self.view_from_dop), view_px)
 
 
-def grey_map(window: MapWindow) -> ImageArray:
-    """The window's orthophoto in grey."""
-    return np.asarray(cv2.cvtColor(window.dop, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-
-
 def warped(
     dop_grey: ImageArray, dop_valid: BoolArray, view_from_dop: FloatArray, width: int, height: int
 ) -> ReferenceView:
@@ -145,7 +140,6 @@ def view_homography(
 
 def predicted_view(
     window: MapWindow,
-    dop_grey: ImageArray,
     local: LocalFrame,
     plane: GroundPlane,
     camera: Camera,
@@ -163,7 +157,7 @@ def predicted_view(
     margin = wider if widen else 0
     wide = camera.padded(margin)
     matrix = view_homography(window, local, plane.abc, wide, local_from_camera)
-    view = warped(dop_grey, window.dop_valid, matrix, wide.width, wide.height)
+    view = warped(window.dop_grey, window.dop_valid, matrix, wide.width, wide.height)
     ahead = _sees_ground(wide, local_from_camera, plane.abc)
     return replace(
         view,
@@ -215,9 +209,9 @@ def _sees_ground(camera: Camera, local_from_camera: Rigid3, plane: FloatArray) -
     return np.asarray((falling * MAX_RANGE_HEIGHTS >= 1.0) & (drop > 0))
 
 
-def quarter_turns(window: MapWindow, dop_grey: ImageArray) -> list[ReferenceView]:
+def quarter_turns(window: MapWindow) -> list[ReferenceView]:
     """The window as it is and turned by 90, 180 and 270 degrees counter-clockwise (paper: "RI")."""
-    bottom, right = dop_grey.shape[0] - 1.0, dop_grey.shape[1] - 1.0
+    bottom, right = window.dop_grid.height - 1.0, window.dop_grid.width - 1.0
     from_dop = (
         np.eye(3),
         np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, right], [0.0, 0.0, 1.0]]),
@@ -226,7 +220,7 @@ def quarter_turns(window: MapWindow, dop_grey: ImageArray) -> list[ReferenceView
     )
     return [
         ReferenceView(
-            np.ascontiguousarray(np.rot90(dop_grey, turns)),
+            np.ascontiguousarray(np.rot90(window.dop_grey, turns)),
             np.ascontiguousarray(np.rot90(window.dop_valid, turns)),
             matrix,
         )

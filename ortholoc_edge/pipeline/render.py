@@ -73,7 +73,7 @@ class Terrain:
     pictures: tuple[_Picture, ...]
 
     @staticmethod
-    def of(window: MapWindow, dop_grey: ImageArray, local: LocalFrame) -> Terrain | None:
+    def of(window: MapWindow, local: LocalFrame) -> Terrain | None:
         """None where the surface model has no data."""
         # NaN spoils a sum but no minimum that leaves it out: one pass where there is none.
         known = None if math.isfinite(float(window.dsm.sum())) else np.isfinite(window.dsm)
@@ -93,7 +93,7 @@ class Terrain:
             max(float(heights.min()), float(believable)),
             float(typical),
             float(heights.max()),
-            _pyramid(dop_grey, window.dop_valid, window.dop_grid),
+            _pyramid(window.dop_grey, window.dop_valid, window.dop_grid),
         )
 
 

@@ -281,7 +281,7 @@ def _resampled(
 ) -> tuple[Float32Array, BoolArray]:
     """The window's orthophoto in grey, and where it is, on cells of which the first's centre is at ``first_map``."""
     ratio = cell_m / window.dop_grid.gsd_m
-    grey: npt.NDArray[Any] = cv2.cvtColor(window.dop, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    grey: npt.NDArray[Any] = window.dop_grey.astype(np.float32)
     if ratio > 1.0:
         # Twice this is a pixel of the result: enough against moire, and no shift.
         grey = cv2.GaussianBlur(grey, (0, 0), 0.4 * ratio)

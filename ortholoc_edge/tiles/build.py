@@ -759,7 +759,9 @@ class _Build:
             features=None,
         )
         georeference = Georeference(manifest.crs, manifest.vertical, manifest.anchor)
-        with MapStore(Pack(self._staged, part, georeference), cache_bytes=_BUILD_CACHE_BYTES) as store:
+        staged = Pack(self._staged, part, georeference)
+        # A store makes GDAL's cache small.
+        with block_cache(_BUILD_CACHE_BYTES), MapStore(staged, cache_bytes=_BUILD_CACHE_BYTES) as store:
             found = alignment.measure(store)
             problems = [*alignment.warnings(found, manifest.dsm.gsd_m), *alignment.misplaced(store)]
         for problem in problems:

@@ -1,12 +1,7 @@
-"""A Cloud Optimized GeoTIFF held in memory: its levels, its blocks, and which of them are damaged.
-
-Decoded blocks live in GDAL's block cache. GDAL has one per process, bounded by one figure, with its own least
-recently used order; a cache of ours on top would hold the same pixels twice.
-"""
+"""A Cloud Optimized GeoTIFF held in memory: its levels, its blocks, and which of them are damaged."""
 
 from __future__ import annotations
 
-import ctypes
 import threading
 import warnings
 import zlib
@@ -31,16 +26,12 @@ from ortholoc_edge.geometry.grid import RasterGrid
 
 BLOCK_PX = 512
 
-# An open level that was read from holds buffers of its own besides GDAL's cache: 1.0 MB of a DOP, 1.7 MB of a DSM
-# (measured). A view lies in at most 4 tiles of either, mostly in one or two; from 2 km above ground it takes in a
-# dozen of each, and with fewer handles than that every read would open them all again. Low above ground `settle` keeps
-# them few.
-MAX_HANDLES = 28
+# An open level that was read from holds 0.9 MB of a DOP, 1.7 MB of a DSM; opening one takes 0.1 to 0.4 ms (measured).
+# The blocks of a tile are read in turn, and what was decoded is kept elsewhere.
+MAX_HANDLES = 2
 
 # Of a pixel: what the sums of coordinates of millions of metres may be off.
 _PLACE_SLACK_PX = 1e-3
-
-_malloc_trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
 
 
 class UndecodableError(MapError):
@@ -74,9 +65,8 @@ class Handles:
     def __init__(self, limit: int = MAX_HANDLES) -> None:
         self.lock = threading.RLock()
         self._limit = limit
-        # By COG and level: the dataset, and the turn it was used in last. Used longest ago first.
-        self._open: OrderedDict[tuple[int, int], tuple[Any, int]] = OrderedDict()
-        self._turn = 0
+        # By COG and level; used longest ago first.
+        self._open: OrderedDict[tuple[int, int], Any] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self._open)
@@ -84,38 +74,19 @@ class Handles:
     def get(self, cog: Cog, level: int) -> Any:
         """A dataset of one level; to be used under ``lock`` only. Raises: MapError, UndecodableError."""
         key = id(cog), level
-        if key in self._open:
-            dataset = self._open[key][0]
-        else:
+        if key not in self._open:
             dataset = cog.open_level(level)
             if len(self._open) >= self._limit:
-                self._close_oldest()
-                _give_back()
-        self._open[key] = dataset, self._turn
+                self._open.popitem(last=False)[1].close()
+            self._open[key] = dataset
         self._open.move_to_end(key)
-        return dataset
-
-    def settle(self) -> None:
-        """End a turn, as one frame's reads are: close what neither it nor the one before used.
-
-        Two, since frames in turn may read another level, or just beyond a tile's border.
-        """
-        with self.lock:
-            count = len(self._open)
-            while self._open and next(iter(self._open.values()))[1] < self._turn - 1:
-                self._close_oldest()
-            if len(self._open) < count:
-                _give_back()
-            self._turn += 1
+        return self._open[key]
 
     def forget(self, cog: Cog) -> None:
         """Close what is open of a COG."""
         with self.lock:
             for key in [key for key in self._open if key[0] == id(cog)]:
-                self._open.pop(key)[0].close()
-
-    def _close_oldest(self) -> None:
-        self._open.popitem(last=False)[1][0].close()
+                self._open.pop(key).close()
 
 
 class Cog:
@@ -157,8 +128,7 @@ class Cog:
         Raises: MapError if it is no tiled GeoTIFF of ours.
         """
         if self._grids is None:
-            with self._handles.lock:
-                full = self._handles.get(self, 0)
+            with self._handles.lock, self._open() as full:
                 if full.block_shapes[0] != (BLOCK_PX, BLOCK_PX):
                     raise MapError(f"{self.path}: blocks of {full.block_shapes[0]} px, expected {BLOCK_PX}")
                 finest = raster_grid(full, self.path)
@@ -171,8 +141,8 @@ class Cog:
     @property
     def crs(self) -> Any:
         """rasterio's CRS, or None."""
-        with self._handles.lock:
-            return self._handles.get(self, 0).crs
+        with self._handles.lock, self._open() as full:
+            return full.crs
 
     def require(self, grids: Mapping[int, RasterGrid], dtypes: Sequence[str], nodata: float | None) -> None:
         """Check that this is the raster it is taken for; of the overviews, that they are there.
@@ -181,8 +151,7 @@ class Cog:
             grids: by level, finest first.
         Raises: MapError naming what differs.
         """
-        with self._handles.lock:
-            full = self._handles.get(self, 0)
+        with self._handles.lock, self._open() as full:
             if full.dtypes != tuple(dtypes) or full.block_shapes[0] != (BLOCK_PX, BLOCK_PX):
                 raise MapError(
                     f"{self.path}: bands of {full.dtypes} in blocks of {full.block_shapes[0]},"
@@ -196,7 +165,7 @@ class Cog:
                 f"{self.path}: levels {levels} of {found}, expected {list(grids)} of {grids[0]}; rebuild the pack"
             )
         # What a level's size is, is seen when it is read.
-        self._grids = grids
+        self._grids, self._nodata = grids, nodata
 
     def read_image(self, level: int, window: PixelWindow) -> tuple[ImageArray, BoolArray]:
         """RGB (3, H, W) uint8, black where invalid, and validity (H, W) of a window inside the level."""
@@ -217,14 +186,17 @@ class Cog:
         for level, grid in self.grids.items():
             yield from touched(level, PixelWindow(0, 0, grid.width, grid.height))
 
+    def window_of(self, block: Block) -> PixelWindow:
+        """A block's pixels: those at the right and lower edge are cropped."""
+        grid = self.grids[block.level]
+        return within(block, PixelWindow(0, 0, grid.width, grid.height))
+
     def undecodable(self) -> list[Block]:
         """Blocks that GDAL cannot decode."""
         bad = []
         for block in self.blocks():
-            grid = self.grids[block.level]
             try:
-                window = within(block, PixelWindow(0, 0, grid.width, grid.height))
-                self._read(block.level, window, with_mask=True)
+                self._read(block.level, self.window_of(block), with_mask=True)
             except UndecodableError:
                 bad.append(block)
         return bad
@@ -253,17 +225,25 @@ class Cog:
         )
 
     def open_level(self, level: int) -> Any:
-        """A rasterio dataset of one level, to be closed by the caller. Raises: MapError, UndecodableError."""
+        """A rasterio dataset of one level, without its place on the map, to be closed by the caller.
+
+        Raises: MapError, UndecodableError.
+        """
+        overview = {} if level == 0 else {"overview_level": self._overview(level)}
+        # To look up the CRS takes five times as long as all the rest of opening.
+        return self._open(GEOREF_SOURCES="NONE", **overview)
+
+    def _open(self, **options: Any) -> Any:
+        """A rasterio dataset; without options of the full resolution, with its place on the map."""
         if self._memory is None:
             raise MapError(f"{self.path}: already closed; open the pack again")
         if not self._data:
             # To rasterio an empty file is one to be written.
             raise UndecodableError(f"{self.path}: empty; copy the pack again")
         # Nothing but a TIFF: other formats of GDAL's lead to other files.
-        overview = {} if level == 0 else {"overview_level": self._overview(level)}
         try:
             with quiet_georeference():
-                return self._memory.open(driver="GTiff", **overview)
+                return self._memory.open(driver="GTiff", **options)
         except (RasterioError, OSError) as err:
             raise UndecodableError(f"{self.path}: cannot be opened ({err}); copy the pack again") from err
 
@@ -294,7 +274,6 @@ class Cog:
     def _read(self, level: int, window: PixelWindow, *, with_mask: bool) -> tuple[Any, Any]:
         area = Window(window.column, window.row, window.width, window.height)
         with self._handles.lock:
-            # The grids first: to find them opens levels, which may close this one.
             grid = self.grids[level]
             dataset = self._handles.get(self, level)
             if dataset.shape != (grid.height, grid.width):
@@ -313,18 +292,18 @@ class Cog:
         return bands, mask
 
 
-def touched(level: int, window: PixelWindow) -> Iterator[Block]:
-    """Blocks that a window of a level has pixels of."""
-    for row in range(window.row // BLOCK_PX, (window.row + window.height - 1) // BLOCK_PX + 1):
-        for column in range(window.column // BLOCK_PX, (window.column + window.width - 1) // BLOCK_PX + 1):
+def touched(level: int, window: PixelWindow, side: int = BLOCK_PX) -> Iterator[Block]:
+    """Blocks, of ``side`` pixels, that a window of a level has pixels of."""
+    for row in range(window.row // side, (window.row + window.height - 1) // side + 1):
+        for column in range(window.column // side, (window.column + window.width - 1) // side + 1):
             yield Block(level, column, row)
 
 
-def within(block: Block, window: PixelWindow) -> PixelWindow:
-    """The part of a window that lies in a block that it touches."""
-    column, row = max(block.column * BLOCK_PX, window.column), max(block.row * BLOCK_PX, window.row)
-    right = min((block.column + 1) * BLOCK_PX, window.column + window.width)
-    lower = min((block.row + 1) * BLOCK_PX, window.row + window.height)
+def within(block: Block, window: PixelWindow, side: int = BLOCK_PX) -> PixelWindow:
+    """The part of a window that lies in a block, of ``side`` pixels, that it touches."""
+    column, row = max(block.column * side, window.column), max(block.row * side, window.row)
+    right = min((block.column + 1) * side, window.column + window.width)
+    lower = min((block.row + 1) * side, window.row + window.height)
     return PixelWindow(column, row, right - column, lower - row)
 
 
@@ -380,15 +359,6 @@ def set_block_cache(limit_bytes: int) -> None:
     """Bound GDAL's block cache of the whole process."""
     with rasterio.Env():
         set_gdal_config("GDAL_CACHEMAX", limit_bytes)
-
-
-def _give_back() -> None:
-    """Let the C library return freed memory to the system, where it can (glibc).
-
-    GDAL allocates blocks of 0.3-1 MB, and glibc keeps what was freed of them: 40 MB over a flight (measured). 0.3 ms.
-    """
-    if _malloc_trim is not None:
-        _malloc_trim(0)
 
 
 def _same_place(found: RasterGrid, wanted: RasterGrid) -> bool:

@@ -77,10 +77,10 @@ def _background(store: MapStore, grid: RasterGrid) -> ImageArray:
 def _fill(block: ImageArray, grid: RasterGrid, store: MapStore) -> None:
     west, south, east, north = grid.bounds
     aside = 2.0 * grid.gsd_m
-    window = store.read((west - aside, south - aside, east + aside, north + aside), grid.gsd_m, grid.gsd_m)
+    window = store.read_colour((west - aside, south - aside, east + aside, north + aside), grid.gsd_m)
     if window is None:
         return
-    dop, valid, source = window.dop, window.dop_valid, window.dop_grid
+    dop, valid, source = window.rgb, window.valid, window.grid
     shrink = min(1.0, source.gsd_m / grid.gsd_m)
     if shrink < 1.0:
         size = (max(1, round(source.width * shrink)), max(1, round(source.height * shrink)))

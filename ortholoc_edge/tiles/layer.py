@@ -17,16 +17,15 @@ import numpy as np
 
 from ortholoc_edge.errors import MapError
 from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, ImageArray
-from ortholoc_edge.tiles.cog import Block, Cog, Handles, PixelWindow, UndecodableError, touched, within
+from ortholoc_edge.tiles.cache import BlockCache, Rasters
+from ortholoc_edge.tiles.cog import BLOCK_PX, Block, Cog, Handles, PixelWindow, UndecodableError, touched, within
 from ortholoc_edge.tiles.levels import halved_heights, halved_image, next_stored
 from ortholoc_edge.tiles.manifest import Dop, Dsm, FileNote, Tile, layer_box
 
 logger = logging.getLogger(__name__)
 
-# Finer pixels that a level which is not stored is averaged from at a time: a window in flight is one strip.
-_STRIP_PX = 4_000_000
-
-_Paste = Callable[[Cog, PixelWindow, tuple[slice, slice]], None]
+# Of a block of a COG: its rasters, averaged as many times as the level wanted is coarser.
+_Decode = Callable[[Cog, Block, int], Rasters]
 
 
 @dataclass(slots=True, eq=False)
@@ -55,12 +54,19 @@ class LoadedLayer:
     """
 
     def __init__(
-        self, layer: Dop | Dsm, folder: Path, handles: Handles, missing: frozenset[str], *, salvage: bool = True
+        self,
+        layer: Dop | Dsm,
+        folder: Path,
+        handles: Handles,
+        cache: BlockCache,
+        missing: frozenset[str],
+        *,
+        salvage: bool = True,
     ) -> None:
         """Read the tiles to memory and check their SHA-256.
 
         Args:
-            handles: that the layers of a store share.
+            handles, cache: that the layers of a store share.
             missing: files that are not there; their tiles are holes and were reported.
             salvage: use the blocks of a damaged tile whose CRC-32 is right. Not where the pack is signed: to a
                 forged block a CRC-32 can be made to fit.
@@ -70,7 +76,7 @@ class LoadedLayer:
         self._box = layer_box(layer.tiles)
         self.grids = tuple(layer.lattice.grid(self._box, level) for level in range(layer.lattice.levels))
         self.damaged: list[str] = []
-        self._handles, self._salvage = handles, salvage
+        self._handles, self._cache, self._salvage = handles, cache, salvage
         self._nodata = layer.nodata if isinstance(layer, Dsm) else None
         self._dtypes = ("float32",) if isinstance(layer, Dsm) else ("uint8",) * 3
         self._held: dict[tuple[int, int], _Held] = {}
@@ -98,77 +104,73 @@ class LoadedLayer:
             for held in self._held.values():
                 held.cog.close()
             self._held = {}
+            self._cache.clear()
 
-    def read_image(self, level: int, window: PixelWindow) -> tuple[ImageArray, BoolArray]:
-        """RGB (H, W, 3) uint8 and validity (H, W) of a window inside a level of a DOP."""
-        stored = next_stored(self._layer.stored, level)
-        if stored == level:
-            return self._stored_image(level, window)
-        rgb = np.empty((window.height, window.width, 3), dtype=np.uint8)
-        valid = np.empty((window.height, window.width), dtype=np.bool_)
-        for rows, finer in _strips(window, level - stored):
-            part = self._stored_image(stored, finer)
-            for _ in range(level - stored):
-                part = halved_image(*part)
-            rgb[rows], valid[rows] = part
+    def read_grey(self, level: int, window: PixelWindow) -> tuple[ImageArray, BoolArray]:
+        """Grey (H, W) uint8, black where invalid, and validity (H, W) of a window inside a level of a DOP."""
+        grey = np.zeros((window.height, window.width), dtype=np.uint8)
+        valid = np.zeros(grey.shape, dtype=np.bool_)
+        self._assemble(level, window, _grey, (grey, valid), keep=True)
+        return grey, valid
+
+    def read_rgb(self, level: int, window: PixelWindow) -> tuple[ImageArray, BoolArray]:
+        """RGB (H, W, 3) uint8, black where invalid, and validity (H, W) of a window inside a level of a DOP.
+
+        Its blocks are decoded anew: nothing in flight asks for colours.
+        """
+        rgb = np.zeros((window.height, window.width, 3), dtype=np.uint8)
+        valid = np.zeros(rgb.shape[:2], dtype=np.bool_)
+        self._assemble(level, window, _rgb, (rgb, valid), keep=False)
         return rgb, valid
 
     def read_heights(self, level: int, window: PixelWindow) -> Float32Array:
         """Heights (H, W) float32 of a window inside a level of a DSM, NaN where there is no data."""
-        stored = next_stored(self._layer.stored, level)
-        if stored == level:
-            return self._stored_heights(level, window)
-        heights = np.empty((window.height, window.width), dtype=np.float32)
-        for rows, finer in _strips(window, level - stored):
-            part, share = self._stored_heights(stored, finer), None
-            for _ in range(level - stored):
-                part, share = halved_heights(part, share)
-            heights[rows] = part
+        heights = np.full((window.height, window.width), np.nan, dtype=np.float32)
+        self._assemble(level, window, _heights, (heights,), keep=True)
         return heights
 
     # -- reading ---------------------------------------------------------------------------------------
 
-    def _stored_image(self, level: int, window: PixelWindow) -> tuple[ImageArray, BoolArray]:
-        rgb = np.zeros((window.height, window.width, 3), dtype=np.uint8)
-        valid = np.zeros((window.height, window.width), dtype=np.bool_)
-
-        def paste(cog: Cog, piece: PixelWindow, place: tuple[slice, slice]) -> None:
-            bands, mask = cog.read_image(level, piece)
-            # Several times as fast as moving the axis.
-            rgb[place] = cv2.merge(list(bands))
-            valid[place] = mask
-
-        self._assemble(level, window, paste)
-        return rgb, valid
-
-    def _stored_heights(self, level: int, window: PixelWindow) -> Float32Array:
-        heights = np.full((window.height, window.width), np.nan, dtype=np.float32)
-
-        def paste(cog: Cog, piece: PixelWindow, place: tuple[slice, slice]) -> None:
-            heights[place] = cog.read_heights(level, piece)
-
-        self._assemble(level, window, paste)
-        return heights
-
-    def _assemble(self, level: int, window: PixelWindow, paste: _Paste) -> None:
-        """Paste what each tile has of a window; where none has anything the target stays as it is."""
-        if self._closed:
-            raise MapError(f"{self._folder}: already closed; open the pack again")
+    def _assemble(self, level: int, window: PixelWindow, decode: _Decode, targets: Rasters, *, keep: bool) -> None:
+        """Paste what each block has of a window; where none has anything the targets stay as they are."""
         left, upper = (self._box.column >> level) + window.column, (self._box.row >> level) + window.row
-        for held, piece in self._tiles_under(level, PixelWindow(left, upper, window.width, window.height)):
-            column, row = (held.note.column >> level) - left, (held.note.row >> level) - upper
+        stored = next_stored(self._layer.stored, level)
+        # A block of a level that is not stored is what one stored block becomes.
+        side = BLOCK_PX >> (level - stored)
+        # Under the lock as a whole: what one reader finds damaged, another must not find half marked.
+        with self._handles.lock:
+            if self._closed:
+                raise MapError(f"{self._folder}: already closed; open the pack again")
+            for held, piece in self._tiles_under(level, PixelWindow(left, upper, window.width, window.height)):
+                if not (held.checked or self._found_as_described(held)):
+                    continue
+                column, row = (held.note.column >> level) - left, (held.note.row >> level) - upper
+                for block in touched(stored, piece, side):
+                    rasters = self._block(held, level, block, decode, keep=keep)
+                    if rasters is None:
+                        continue
+                    part = within(block, piece, side)
+                    source = _slices(part, -block.column * side, -block.row * side)
+                    place = _slices(part, column, row)
+                    for target, raster in zip(targets, rasters, strict=True):
+                        target[place] = raster[source]
 
-            def paste_piece(part: PixelWindow, held: _Held = held, column: int = column, row: int = row) -> None:
-                at_row, at_column = row + part.row, column + part.column
-                place = slice(at_row, at_row + part.height), slice(at_column, at_column + part.width)
-                paste(held.cog, part, place)
-
-            # Under the lock as a whole: what one reader finds damaged, another must not find half marked.
-            with self._handles.lock:
-                if self._closed:
-                    raise MapError(f"{self._folder}: closed while it was read; open the pack again")
-                if held.checked or self._found_as_described(held):
-                    self._paste_sound(held, level, piece, paste_piece)
+    def _block(self, held: _Held, level: int, block: Block, decode: _Decode, *, keep: bool) -> Rasters | None:
+        """What a stored block shows at a level; None: it is damaged."""
+        if block in held.damaged:
+            return None
+        key = held.note.file, level, block
+        rasters = self._cache.get(key) if keep else None
+        if rasters is None:
+            try:
+                rasters = decode(held.cog, block, level - block.level)
+            except UndecodableError as err:
+                held.damaged |= {block}
+                self._tell(held, err)
+                return None
+            if keep:
+                self._cache.put(key, rasters)
+        return rasters
 
     def _tiles_under(self, level: int, window: PixelWindow) -> Iterator[tuple[_Held, PixelWindow]]:
         """Tiles that a window of the lattice's level meets, each with the part of it that is met, in the tile's own
@@ -185,31 +187,6 @@ class LoadedLayer:
                 north, south = max(row, window.row), min(row + height, lower)
                 if west < east and north < south:
                     yield held, PixelWindow(west - column, north - row, east - west, south - north)
-
-    def _paste_sound(
-        self, held: _Held, level: int, piece: PixelWindow, paste_piece: Callable[[PixelWindow], None]
-    ) -> None:
-        blocks = list(touched(level, piece))
-        sound = [block for block in blocks if block not in held.damaged]
-        if len(sound) == len(blocks):
-            try:
-                paste_piece(piece)
-            except UndecodableError as err:
-                if len(blocks) == 1:
-                    self._mark(held, blocks[0], err)
-                    return
-            else:
-                return
-        # Around the bad blocks; those found only now are found one by one.
-        for block in sound:
-            try:
-                paste_piece(within(block, piece))
-            except UndecodableError as err:
-                self._mark(held, block, err)
-
-    def _mark(self, held: _Held, block: Block, why: MapError) -> None:
-        held.damaged |= {block}
-        self._tell(held, why)
 
     def _found_as_described(self, held: _Held) -> bool:
         """Whether a tile is the raster that the manifest describes; if not, it is a hole from now on."""
@@ -265,18 +242,33 @@ class LoadedLayer:
         return held
 
 
-def _strips(window: PixelWindow, steps: int) -> Iterator[tuple[slice, PixelWindow]]:
-    """A window in strips, each as its rows and as the window of the level ``steps`` finer that it is averaged from.
+def _rgb(cog: Cog, block: Block, steps: int) -> tuple[ImageArray, BoolArray]:
+    bands, valid = cog.read_image(block.level, cog.window_of(block))
+    # Several times as fast as moving the axis.
+    rgb = np.asarray(cv2.merge(list(bands)), dtype=np.uint8)
+    for _ in range(steps):
+        rgb, valid = halved_image(rgb, valid)
+    return rgb, valid
 
-    A reader's limit is on what it asks for; of the finer pixels, 4 or 16 times as many, few are held at a time.
-    """
-    count = max(_STRIP_PX // (window.width << 2 * steps), 1)
-    for row in range(0, window.height, count):
-        height = min(count, window.height - row)
-        yield (
-            slice(row, row + height),
-            PixelWindow(window.column << steps, (window.row + row) << steps, window.width << steps, height << steps),
-        )
+
+def _grey(cog: Cog, block: Block, steps: int) -> tuple[ImageArray, BoolArray]:
+    rgb, valid = _rgb(cog, block, steps)
+    grey = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+    # Most blocks are valid all over: one value stands for that.
+    return grey, np.broadcast_to(np.True_, valid.shape) if valid.all() else valid
+
+
+def _heights(cog: Cog, block: Block, steps: int) -> tuple[Float32Array]:
+    heights, share = cog.read_heights(block.level, cog.window_of(block)), None
+    for _ in range(steps):
+        heights, share = halved_heights(heights, share)
+    return (heights,)
+
+
+def _slices(window: PixelWindow, columns: int, rows: int) -> tuple[slice, slice]:
+    """A window, moved."""
+    row, column = window.row + rows, window.column + columns
+    return slice(row, row + window.height), slice(column, column + window.width)
 
 
 def read_listed(path: Path, note: FileNote) -> bytes:

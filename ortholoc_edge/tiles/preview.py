@@ -179,13 +179,14 @@ def _read(store: MapStore, grid: RasterGrid) -> tuple[ImageArray, BoolArray, Flo
     for row in range(0, grid.height, step):
         for column in range(0, grid.width, step):
             piece = grid.crop(column, row, min(step, grid.width - column), min(step, grid.height - row))
-            window = store.read(piece.bounds, grid.dx / math.sqrt(2.0), grid.dx)
-            if window is None:
+            picture = store.read_colour(piece.bounds, grid.dx / math.sqrt(2.0))
+            surface = None if picture is None else store.read_surface(picture.grid, grid.dx)
+            if picture is None or surface is None:
                 continue
             place = np.s_[row : row + piece.height, column : column + piece.width]
-            dop[place] = _sampled(window.dop, window.dop_grid, piece)
-            valid[place] = _sampled(window.dop_valid.astype(np.uint8), window.dop_grid, piece, nearest=True) > 0
-            heights[place] = _sampled(window.dsm, window.dsm_grid, piece, nearest=True, outside=np.nan)
+            dop[place] = _sampled(picture.rgb, picture.grid, piece)
+            valid[place] = _sampled(picture.valid.astype(np.uint8), picture.grid, piece, nearest=True) > 0
+            heights[place] = _sampled(surface.dsm, surface.dsm_grid, piece, nearest=True, outside=np.nan)
     return dop, valid, heights
 
 

@@ -1,7 +1,7 @@
 """Preloaded packs, read by region.
 
-A store holds the compressed files in memory and decodes on demand, so that resident memory is their size plus
-the cache limit, whatever the area, and no read touches the disk in flight.
+A store holds the compressed files in memory, decodes on demand and keeps what it decoded last, so that resident memory
+is their size plus the cache limit, whatever the area, and no read touches the disk in flight.
 """
 
 from __future__ import annotations
@@ -17,18 +17,21 @@ import numpy.typing as npt
 from ortholoc_edge.errors import MapError
 from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.grid import RasterGrid, bilinear
+from ortholoc_edge.tiles.cache import BlockCache
 from ortholoc_edge.tiles.cog import BLOCK_PX, Handles, PixelWindow, set_block_cache
 from ortholoc_edge.tiles.lattice import Bounds
 from ortholoc_edge.tiles.layer import LoadedLayer, read_listed
 from ortholoc_edge.tiles.manifest import FeatureTile, FileNote
 from ortholoc_edge.tiles.pack import Pack
-from ortholoc_edge.tiles.window import MapWindow, SurfaceWindow
+from ortholoc_edge.tiles.window import ColourWindow, MapWindow, SurfaceWindow
 
 logger = logging.getLogger(__name__)
 
-# The blocks of one view, of DOP and DSM, which the next frame mostly looks at again: with 12 MiB a view of nine blocks
-# pushes itself out, and reading it again takes two to four times as long as with 20 (real flights, measured).
-CACHE_BYTES = 20 * 2**20
+# A view of 768 x 576 px and its heights are 4 to 6 MiB of blocks, stored or averaged: with less it pushes itself out,
+# and with more a flight decodes no less (measured).
+CACHE_BYTES = 8 * 2**20
+# GDAL's own cache, of the whole process: a block is read from it once and as a whole, so one is enough.
+_GDAL_CACHE_BYTES = 2**20
 # Of compressed files: about 190 km2 at 4 MB per km2.
 MEMORY_BYTES = 768 * 2**20
 
@@ -52,8 +55,7 @@ class MapStore:
     """DOP and DSM of a pack, in memory. Safe to read from several threads.
 
     A tile that is missing, or damaged, is a hole: no data, as where the survey had none; a damaged tile of which
-    only some blocks are bad has holes there. The cache limit is the process's: GDAL has one block cache, and the
-    store opened last sets its size.
+    only some blocks are bad has holes there. Sets GDAL's block cache, of which a process has one, to a block's size.
     """
 
     def __init__(
@@ -69,7 +71,7 @@ class MapStore:
         """Read the files to memory and check their SHA-256; each that is damaged gives one warning.
 
         Args:
-            cache_bytes: limit of decoded blocks.
+            cache_bytes: limit of decoded blocks, in grey or heights, of the levels that are read.
             memory_bytes: limit of the compressed files, which all are held.
             max_pixels: largest raster that one read may return.
             features: hold the precomputed features too, if the pack has any.
@@ -89,11 +91,12 @@ class MapStore:
                 f" {memory_bytes / 2**20:.0f} MiB are allowed; rebuild the pack with a smaller --area or with"
                 f" --max-size, or raise map.memory_mb"
             )
-        set_block_cache(cache_bytes)
-        self._handles = handles = Handles()
-        self._dop = LoadedLayer(manifest.dop, pack.path, handles, pack.missing, salvage=not pack.signed)
+        set_block_cache(_GDAL_CACHE_BYTES)
+        self._cache = BlockCache(cache_bytes)
+        shared = pack.path, Handles(), self._cache, pack.missing
+        self._dop = LoadedLayer(manifest.dop, *shared, salvage=not pack.signed)
         try:
-            self._dsm = LoadedLayer(manifest.dsm, pack.path, handles, pack.missing, salvage=not pack.signed)
+            self._dsm = LoadedLayer(manifest.dsm, *shared, salvage=not pack.signed)
         except BaseException:
             self._dop.close()
             raise
@@ -165,32 +168,32 @@ class MapStore:
         Raises: WindowTooLargeError for a window over ``max_pixels``; MapError after `close`; ValueError for bounds
             or a GSD that are no such.
         """
-        west, south, east, north = bounds_map
-        if not (all(map(isfinite, bounds_map)) and west < east and south < north):
-            raise ValueError(f"bounds (west, south, east, north) {bounds_map} unusable")
-        if not (isfinite(gsd_m) and gsd_m > 0) or not (dsm_gsd_m is None or dsm_gsd_m > 0):
-            raise ValueError(f"gsd_m {gsd_m}, dsm_gsd_m {dsm_gsd_m} must be positive")
-        level = _coarsest(self._dop.grids, gsd_m * sqrt(2.0))
-        window = _pixels(self._dop.grids[level], bounds_map, margin=0)
-        if window is None:
+        found = self._dop_window(bounds_map, gsd_m)
+        if found is None:
             return None
-        dop_grid = self._dop.grids[level].crop(*window)
-        dsm_level = _coarsest(self._dsm.grids, 2.0 * dop_grid.gsd_m if dsm_gsd_m is None else dsm_gsd_m)
-        dsm_window = _pixels(self._dsm.grids[dsm_level], dop_grid.bounds, margin=1)
+        level, window, dop_grid = found
+        dsm_level, dsm_window = self._dsm_window(dop_grid, 2.0 * dop_grid.gsd_m if dsm_gsd_m is None else dsm_gsd_m)
         if dsm_window is None:
             return None
-        for name, size in (("DOP", window), ("DSM", dsm_window)):
-            if size.width * size.height > self.max_pixels:
-                raise WindowTooLargeError(
-                    f"{name} window of {size.width} x {size.height} px exceeds {self.max_pixels} px;"
-                    " ask for a smaller region or a larger gsd_m"
-                )
-        dop, valid = self._dop.read_image(level, window)
+        grey, valid = self._dop.read_grey(level, window)
         dsm = self._dsm.read_heights(dsm_level, dsm_window)
-        self._handles.settle()
-        for array in (dop, valid, dsm):
+        for array in (grey, valid, dsm):
             array.flags.writeable = False
-        return MapWindow(dop, valid, dop_grid, dsm, self._dsm.grids[dsm_level].crop(*dsm_window))
+        return MapWindow(grey, valid, dop_grid, dsm, self._dsm.grids[dsm_level].crop(*dsm_window))
+
+    def read_colour(self, bounds_map: Bounds, gsd_m: float) -> ColourWindow | None:
+        """The orthophoto that `read` gives in grey, in colour. For pictures: it decodes anew each time.
+
+        Returns: None where the region holds no pixel of it. Raises: as `read`.
+        """
+        found = self._dop_window(bounds_map, gsd_m)
+        if found is None:
+            return None
+        level, window, grid = found
+        rgb, valid = self._dop.read_rgb(level, window)
+        for array in (rgb, valid):
+            array.flags.writeable = False
+        return ColourWindow(rgb, valid, grid)
 
     def read_surface(self, grid: RasterGrid, dsm_gsd_m: float) -> SurfaceWindow | None:
         """Heights under a grid, as `read` gives them with an orthophoto of that grid.
@@ -198,15 +201,9 @@ class MapStore:
         Returns: None where the DSM has no pixel there.
         Raises: WindowTooLargeError, MapError after `close`.
         """
-        level = _coarsest(self._dsm.grids, dsm_gsd_m)
-        window = _pixels(self._dsm.grids[level], grid.bounds, margin=1)
+        level, window = self._dsm_window(grid, dsm_gsd_m)
         if window is None:
             return None
-        if window.width * window.height > self.max_pixels:
-            raise WindowTooLargeError(
-                f"DSM window of {window.width} x {window.height} px exceeds {self.max_pixels} px;"
-                " ask for a smaller region or a larger dsm_gsd_m"
-            )
         dsm = self._dsm.read_heights(level, window)
         dsm.flags.writeable = False
         return SurfaceWindow(grid, dsm, self._dsm.grids[level].crop(*window))
@@ -251,6 +248,41 @@ class MapStore:
             raster = self._dsm.read_heights(level, window)
             heights[rows[own]] = bilinear(raster, px[rows[own]] - (column, row))
         return heights
+
+    def forget_decoded(self) -> None:
+        """Empty the cache of decoded blocks, to time reads without."""
+        self._cache.clear()
+
+    def _dop_window(self, bounds: Bounds, gsd_m: float) -> tuple[int, PixelWindow, RasterGrid] | None:
+        """Level, pixels and grid of a region of the DOP; None where it has no pixel."""
+        west, south, east, north = bounds
+        if not (all(map(isfinite, bounds)) and west < east and south < north):
+            raise ValueError(f"bounds (west, south, east, north) {bounds} unusable")
+        if not (isfinite(gsd_m) and gsd_m > 0):
+            raise ValueError(f"gsd_m {gsd_m} must be positive")
+        level = _coarsest(self._dop.grids, gsd_m * sqrt(2.0))
+        window = _pixels(self._dop.grids[level], bounds, margin=0)
+        if window is None:
+            return None
+        self._check_size("DOP", window)
+        return level, window, self._dop.grids[level].crop(*window)
+
+    def _dsm_window(self, grid: RasterGrid, gsd_m: float) -> tuple[int, PixelWindow | None]:
+        """Level and pixels of the DSM under a grid, and one more on each side."""
+        if not gsd_m > 0:
+            raise ValueError(f"dsm_gsd_m {gsd_m} must be positive")
+        level = _coarsest(self._dsm.grids, gsd_m)
+        window = _pixels(self._dsm.grids[level], grid.bounds, margin=1)
+        if window is not None:
+            self._check_size("DSM", window)
+        return level, window
+
+    def _check_size(self, name: str, window: PixelWindow) -> None:
+        if window.width * window.height > self.max_pixels:
+            raise WindowTooLargeError(
+                f"{name} window of {window.width} x {window.height} px exceeds {self.max_pixels} px;"
+                " ask for a smaller region or a larger gsd_m"
+            )
 
     def _load_features(self, tile: FeatureTile) -> None:
         try:

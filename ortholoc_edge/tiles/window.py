@@ -1,4 +1,4 @@
-"""DOP and DSM of one region, as the localizer takes them."""
+"""DOP and DSM of one region: in grey as the localizer takes them, in colour for people."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ class MapWindow:
     """A region of the map. The two rasters have grids of their own; neither is resampled onto the other.
 
     Attributes:
-        dop: (H, W, 3) uint8 RGB on ``dop_grid``, one of the pack's overview levels.
+        dop_grey: (H, W) uint8 on ``dop_grid``, one of the pack's levels; black where the orthophoto has no data.
         dop_valid: (H, W) bool, False where the orthophoto has no data.
         dsm: (h, w) float32 heights in metres on ``dsm_grid``, in the pack's vertical datum; NaN where there is
             no data.
     """
 
-    dop: ImageArray
+    dop_grey: ImageArray
     dop_valid: BoolArray
     dop_grid: RasterGrid
     dsm: Float32Array
@@ -38,3 +38,16 @@ class SurfaceWindow:
     dop_grid: RasterGrid
     dsm: Float32Array
     dsm_grid: RasterGrid
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ColourWindow:
+    """A region's orthophoto in colour, for pictures.
+
+    Attributes:
+        rgb: (H, W, 3) uint8 on ``grid``; black where ``valid`` (H, W) is False.
+    """
+
+    rgb: ImageArray
+    valid: BoolArray
+    grid: RasterGrid

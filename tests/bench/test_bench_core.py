@@ -323,13 +323,13 @@ def test_the_map_in_view_shows_each_place_where_the_camera_sees_it(scene: Scene)
     x, y = np.meshgrid(np.linspace(-25.0, 25.0, 40), np.linspace(-20.0, 20.0, 40))
     places = pose.translation[:2] + np.column_stack([x.ravel(), y.ravel()])
     (west, south), (east, north) = places.min(axis=0) - 5.0, places.max(axis=0) + 5.0
-    window = scene.store.read((west, south, east, north), 0.2)
+    window = scene.store.read_colour((west, south, east, north), 0.2)
 
     def difference(moved_m: float) -> float:
         points = np.column_stack([places, scene.store.heights(places)])
         at = np.round(camera.project(pose.inverse().apply(points))).astype(int)
-        there = np.round(window.dop_grid.px_from_map(np.add(places, (moved_m, 0.0)))).astype(int)
-        colours = drawn[at[:, 1], at[:, 0]].astype(float) - window.dop[there[:, 1], there[:, 0]]
+        there = np.round(window.grid.px_from_map(np.add(places, (moved_m, 0.0)))).astype(int)
+        colours = drawn[at[:, 1], at[:, 0]].astype(float) - window.rgb[there[:, 1], there[:, 0]]
         return float(np.median(np.abs(colours).max(axis=1)))
 
     # The median: what hides behind a house is drawn on it.

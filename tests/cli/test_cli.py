@@ -416,9 +416,9 @@ def test_replay_table(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_replay_of_an_ortholoc_sample(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """In a frame of its own, as OrthoLoC's are: the corner of the window is zero."""
     east, north, _ = TRUTH.translation
-    window = rendered.store().read((east - 60, north - 60, east + 60, north + 60), 0.25, 0.25)
+    window = rendered.store().read_colour((east - 60, north - 60, east + 60, north + 60), 0.25)
     assert window is not None
-    grid = window.dop_grid
+    grid = window.grid
     u, v = np.meshgrid(np.arange(grid.width), np.arange(grid.height))
     xy = grid.map_from_px(np.stack([u, v], axis=-1))
     heights = rendered.store().heights(xy.reshape(-1, 2)).reshape(u.shape)
@@ -428,7 +428,7 @@ def test_replay_of_an_ortholoc_sample(kind: str, tmp_path: Path, capsys: pytest.
     np.savez(
         tmp_path / "sample.npz",
         image_query=rendered.picture(TRUTH),
-        image_dop=window.dop,
+        image_dop=window.rgb,
         dsm=(np.dstack([xy, heights]) - origin).astype(np.float32),
         scale=np.array(grid.dx) if kind == "number" else np.array([grid.dx, grid.dy]),
         extrinsics=np.column_stack([inverse.rotation, inverse.translation]),

@@ -317,8 +317,9 @@ def write_rasters(folder: Path, crs: str | None, hole_m: tuple[float, float, flo
     folder.mkdir(parents=True, exist_ok=True)
     x, y = rendered.pose().translation[:2]
     bounds = (x - 130, y - 130, x + 130, y + 130)
-    window = rendered.store().read(bounds, 0.5)
+    window, picture = rendered.store().read(bounds, 0.5), rendered.store().read_colour(bounds, 0.5)
     assert window is not None
+    assert picture is not None
     paths = folder / "dop_source.tif", folder / "dsm_source.tif"
     heights = window.dsm.copy()
     if hole_m is not None:
@@ -329,7 +330,7 @@ def write_rasters(folder: Path, crs: str | None, hole_m: tuple[float, float, flo
         inside = (at[..., 0] > west) & (at[..., 0] < east) & (at[..., 1] > south) & (at[..., 1] < north)
         heights[inside] = np.nan
     for path, bands, grid in (
-        (paths[0], np.moveaxis(window.dop, 2, 0), window.dop_grid),
+        (paths[0], np.moveaxis(picture.rgb, 2, 0), picture.grid),
         (paths[1], heights[None], window.dsm_grid),
     ):
         with rasterio.open(

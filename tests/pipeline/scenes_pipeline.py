@@ -63,4 +63,4 @@ def ramp_window(grid: RasterGrid, plane: FloatArray, dsm_step: int = 4) -> MapWi
     centres = dsm_grid.map_from_px(np.stack([columns, rows], axis=-1)) - (grid.west, grid.top)
     dsm = (plane[0] + centres @ plane[1:]).astype(np.float32)
     shape = (grid.height, grid.width)
-    return MapWindow(np.zeros((*shape, 3), np.uint8), np.ones(shape, bool), grid, dsm, dsm_grid)
+    return MapWindow(np.zeros(shape, np.uint8), np.ones(shape, bool), grid, dsm, dsm_grid)

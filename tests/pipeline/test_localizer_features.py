@@ -100,7 +100,7 @@ def _add_features(path: Path, matcher: XFeatMatcher) -> None:
             ).T.astype(int)
             near = np.zeros_like(valid)
             near[max(upper, 0) : max(lower, 0), max(left, 0) : max(right, 0)] = True
-            levels.append((np.asarray(cv2.cvtColor(window.dop, cv2.COLOR_RGB2GRAY), np.uint8), valid & near))
+            levels.append((window.dop_grey, valid & near))
         data, counts = features.extract_tile(levels, matcher, PER_MPX)
         if not data:
             continue

@@ -1,5 +1,7 @@
 """Views of the map against the camera's own projection."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -67,7 +69,8 @@ def test_predicted_view_shows_a_dot_where_the_camera_would(tilt_deg, slopes):
     dop_px = np.round(GRID.px_from_map(middle + np.array([4.0, 7.0])))
     v, u = np.mgrid[: GRID.height, : GRID.width]
     dop = 255 * np.exp(-0.5 * ((u - dop_px[0]) ** 2 + (v - dop_px[1]) ** 2) / 3.0**2)
-    view = precondition.predicted_view(window, np.round(dop).astype(np.uint8), LOCAL, fitted, CAMERA, prior, True)
+    window = replace(window, dop_grey=np.round(dop).astype(np.uint8))
+    view = precondition.predicted_view(window, LOCAL, fitted, CAMERA, prior, True)
     xy = GRID.map_from_px(dop_px)
     point = np.array([*xy, plane[0] + (xy - (WEST, TOP)) @ plane[1:]])
     local_from_camera = LOCAL.local_from_map_pose(prior.map_from_camera)
@@ -86,8 +89,8 @@ def test_predicted_view_shows_a_dot_where_the_camera_would(tilt_deg, slopes):
 def view_of(prior, plane=(0.0, 0.0, 0.0), camera=CAMERA):
     window = ramp_window(RasterGrid(600, 600, -300.0, 300.0, 1.0, -1.0), np.zeros(3))
     local = LocalFrame(0.0, 0.0, 1.0)
-    dop = np.full((600, 600), 128, np.uint8)
-    return precondition.predicted_view(window, dop, local, GroundPlane(np.array(plane), 0.0), camera, prior, True)
+    window.dop_grey[:] = 128
+    return precondition.predicted_view(window, local, GroundPlane(np.array(plane), 0.0), camera, prior, True)
 
 
 @given(finite(0, 60), finite(-180, 180), st.integers(0, 1000))
@@ -132,10 +135,10 @@ def test_camera_below_the_plane_sees_nothing():
 def test_nodata_of_the_orthophoto_is_not_valid():
     window = ramp_window(RasterGrid(600, 600, -300.0, 300.0, 1.0, -1.0), np.zeros(3))
     window.dop_valid[:, :300] = False
-    dop = np.full((600, 600), 9, np.uint8)
+    window.dop_grey[:] = 9
     prior = pose_prior(sigma_m=(0.1,) * 3, sigma_deg=(0.1,) * 3)
     local, plane = LocalFrame(0.0, 0.0, 1.0), GroundPlane(np.zeros(3), 0.0)
-    view = precondition.predicted_view(window, dop, local, plane, CAMERA, prior, True)
+    view = precondition.predicted_view(window, local, plane, CAMERA, prior, True)
     # Heading north, west is on the left.
     assert not view.valid[:, :158].any()
     assert view.valid[:, 162:].all()
@@ -189,7 +192,7 @@ def test_quarter_turns_show_what_their_homographies_say(height, width):
     grey = np.arange(height * width, dtype=np.uint8).reshape(height, width)
     window = ramp_window(RasterGrid(width, height, 0.0, 0.0, 1.0, -1.0), np.zeros(3), dsm_step=1)
     window.dop_valid[0, -1] = False
-    views = precondition.quarter_turns(window, grey)
+    views = precondition.quarter_turns(replace(window, dop_grey=grey))
     assert len(views) == 4
     u, v = np.meshgrid(np.arange(width), np.arange(height))
     dop_px = np.column_stack([u.ravel(), v.ravel()]).astype(float)

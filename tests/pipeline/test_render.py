@@ -16,7 +16,6 @@ from ortholoc_edge.geometry.arrays import BoolArray, FloatArray
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.grid import RasterGrid, bilinear
 from ortholoc_edge.geometry.rigid import Rigid3
-from ortholoc_edge.pipeline.precondition import grey_map
 from ortholoc_edge.pipeline.prior import MAX_RANGE_HEIGHTS
 from ortholoc_edge.pipeline.render import RenderedView, Terrain, render
 from ortholoc_edge.tiles.georeference import LocalFrame
@@ -90,7 +89,7 @@ class Place:
     def window(self) -> MapWindow:
         """A copy of its own."""
         made = _painted(self)
-        return MapWindow(made.dop.copy(), made.dop_valid.copy(), made.dop_grid, made.dsm.copy(), made.dsm_grid)
+        return MapWindow(made.dop_grey.copy(), made.dop_valid.copy(), made.dop_grid, made.dsm.copy(), made.dsm_grid)
 
     def pose(
         self,
@@ -111,7 +110,7 @@ def _painted(place: Place) -> MapWindow:
     dop_grid = place.grid(place.dop_m, place.dop_up)
     dsm = place.surface(*_centres(dsm_grid)).astype(np.float32)
     dop = np.rint(paint(*_centres(dop_grid))).astype(np.uint8)
-    return MapWindow(np.repeat(dop[..., None], 3, axis=2), np.ones(dop.shape, np.bool_), dop_grid, dsm, dsm_grid)
+    return MapWindow(dop, np.ones(dop.shape, np.bool_), dop_grid, dsm, dsm_grid)
 
 
 def _centres(grid: RasterGrid) -> tuple[FloatArray, FloatArray]:
@@ -121,7 +120,7 @@ def _centres(grid: RasterGrid) -> tuple[FloatArray, FloatArray]:
 
 
 def terrain_of(window: MapWindow, local: LocalFrame) -> Terrain:
-    made = Terrain.of(window, grey_map(window), local)
+    made = Terrain.of(window, local)
     assert made is not None
     return made
 
@@ -491,7 +490,7 @@ def test_holes_of_the_orthophoto_are_invalid(height_m: float) -> None:
     place = Place(level, reach_m=200.0, dsm_m=1.0)
     window = place.window
     window.dop_valid[hole_in(window.dop_grid)] = False
-    window.dop[~window.dop_valid] = 0
+    window.dop_grey[~window.dop_valid] = 0
     view = drawn(place, place.pose(height_m, 20.0), window=window)
     at = place.local.local_from_map([EAST, NORTH, GROUND_M])
     ground = place.local.map_from_local(on_plane(view, every_px(CAMERA), 0.0, 0.0, at))[:, :2]
@@ -533,7 +532,7 @@ def test_no_height_at_all_is_no_terrain() -> None:
     place = Place(level, reach_m=20.0)
     window = place.window
     window.dsm[:] = np.nan
-    assert Terrain.of(window, grey_map(window), place.local) is None
+    assert Terrain.of(window, place.local) is None
 
 
 def test_infinite_heights_are_holes() -> None:
@@ -551,10 +550,10 @@ def test_what_is_drawn_does_not_change_the_window() -> None:
     place = Place(hills, reach_m=40.0)
     window = place.window
     window.dsm[3, 3] = np.nan
-    before = window.dsm.copy(), window.dop.copy()
+    before = window.dsm.copy(), window.dop_grey.copy()
     drawn(place, place.pose(40.0), window=window)
     assert np.array_equal(window.dsm, before[0], equal_nan=True)
-    assert np.array_equal(window.dop, before[1])
+    assert np.array_equal(window.dop_grey, before[1])
 
 
 def test_as_many_points_as_pixels() -> None:

@@ -25,7 +25,6 @@ from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.gate import GateOptions
 from ortholoc_edge.pipeline.localizer import Localizer, LocalizerOptions
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
-from ortholoc_edge.pipeline.precondition import grey_map
 from ortholoc_edge.pipeline.prior import PosePrior, RegionPrior
 from ortholoc_edge.pipeline.render import Terrain, render
 from ortholoc_edge.pipeline.structural import TUNING, QueryMaker, Track, Tracking
@@ -461,13 +460,13 @@ def painted(side_m: float = 240.0, holes: Callable[[MapWindow], None] | None = N
     v, u = np.mgrid[:dsm_side, :dsm_side]
     heights = (GROUND_M + 2.0 * np.sin(u / 13.0) + 2.0 * np.cos(v / 17.0)).astype(np.float32)
     window = MapWindow(
-        np.repeat(grey[..., None], 3, axis=2), np.ones(grey.shape, np.bool_),
+        grey, np.ones(grey.shape, np.bool_),
         RasterGrid(dop_side, dop_side, west, top, 0.4, -0.4), heights,
         RasterGrid(dsm_side, dsm_side, west, top, 1.0, -1.0),
     )  # fmt: skip
     if holes is not None:
         holes(window)
-    terrain = Terrain.of(window, grey_map(window), LocalFrame(EAST, NORTH, 0.9997))
+    terrain = Terrain.of(window, LocalFrame(EAST, NORTH, 0.9997))
     assert terrain is not None
     return terrain
 
@@ -516,9 +515,9 @@ def test_matches_are_in_pixels_of_the_full_frame() -> None:
 
 def orchard(window: MapWindow) -> None:
     """Trees 8 m apart, all alike."""
-    v, u = np.mgrid[: window.dop.shape[0], : window.dop.shape[1]] * 0.4
+    v, u = np.mgrid[: window.dop_grey.shape[0], : window.dop_grey.shape[1]] * 0.4
     near = np.hypot((u % 8.0) - 4.0, (v % 8.0) - 4.0)
-    window.dop[:] = np.where(near < 1.6, 60, 160).astype(np.uint8)[..., None]
+    window.dop_grey[:] = np.where(near < 1.6, 60, 160)
     window.dsm[:] = GROUND_M
 
 
@@ -545,8 +544,8 @@ def no_heights_east(window: MapWindow) -> None:
 
 
 def no_picture_north(window: MapWindow) -> None:
-    window.dop_valid[: window.dop.shape[0] // 2] = False
-    window.dop[~window.dop_valid] = 0
+    window.dop_valid[: window.dop_grey.shape[0] // 2] = False
+    window.dop_grey[~window.dop_valid] = 0
 
 
 def moth_eaten(window: MapWindow) -> None:

@@ -53,7 +53,7 @@ def test_bilinear_on_a_raster_of_one_row_or_column(shape):
 
 def window(dop_grid, dsm_grid, dsm):
     shape = (dop_grid.height, dop_grid.width)
-    return MapWindow(np.zeros((*shape, 3), np.uint8), np.ones(shape, bool), dop_grid, dsm, dsm_grid)
+    return MapWindow(np.zeros(shape, np.uint8), np.ones(shape, bool), dop_grid, dsm, dsm_grid)
 
 
 def test_lift_between_grids_of_different_pixel_origin_and_direction():

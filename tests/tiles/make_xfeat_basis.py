@@ -10,7 +10,6 @@ second level, all by WEBP-85 packs; this script takes the finest. Another basis 
 import sys
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from ortholoc_edge.matching.registry import make_matcher
@@ -26,7 +25,7 @@ def descriptors(pack, enlarge, matcher, rng):
     found = []
     with MapStore(Pack.open(pack), max_pixels=2**31) as store:
         window = store.read(store.bounds, store.dop_grids[0].gsd_m)
-    grey = cv2.cvtColor(window.dop, cv2.COLOR_RGB2GRAY)
+    grey = window.dop_grey
     for row in range(0, grey.shape[0] * enlarge, features.WORKING_PX):
         for column in range(0, grey.shape[1] * enlarge, features.WORKING_PX):
             image, seen = features._window(grey, window.dop_valid, enlarge, column, row)

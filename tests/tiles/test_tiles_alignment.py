@@ -212,7 +212,7 @@ def test_holes_of_both_layers_are_no_edges(scene):
     grey = np.clip(random.normal(120, 5, (400, 400)), 0, 255).astype(np.uint8)
     grey[hole] = 0
     heights = np.where(hole, np.nan, random.normal(100, 0.1, (400, 400))).astype(np.float32)
-    window = MapWindow(np.repeat(grey[:, :, None], 3, axis=2), ~hole, grid, heights, grid)
+    window = MapWindow(grey, ~hole, grid, heights, grid)
     surfaces = correlations(window)
     assert len(surfaces) >= 16
     assert consensus(surfaces, DSM_M) is None

@@ -14,7 +14,7 @@ from rasterio.io import MemoryFile
 
 from ortholoc_edge.errors import MapError
 from ortholoc_edge.geometry.grid import RasterGrid
-from ortholoc_edge.tiles import encode, layer
+from ortholoc_edge.tiles import encode
 from ortholoc_edge.tiles.cog import Cog, PixelWindow
 from ortholoc_edge.tiles.lattice import LEVELS
 from ortholoc_edge.tiles.levels import STORED_LEVELS, filled, halved_heights, halved_image, next_stored
@@ -194,11 +194,11 @@ def test_a_level_that_is_not_stored_is_the_mean_of_the_next_finer_one(lossy):
     assert (len(store.dop_grids), len(store.dsm_grids)) == (LEVELS, LEVELS)
     for level in range(LEVELS):
         if level in pack.manifest.dop.stored:
-            image = store._dop.read_image(level, whole(store.dop_grids[level]))
+            image = store._dop.read_rgb(level, whole(store.dop_grids[level]))
             heights, share = store._dsm.read_heights(level, whole(store.dsm_grids[level])), None
             continue
         image, (heights, share) = halved_image(*image), halved_heights(heights, share)
-        found = store._dop.read_image(level, whole(store.dop_grids[level]))
+        found = store._dop.read_rgb(level, whole(store.dop_grids[level]))
         assert found[0].shape[:2] == (store.dop_grids[level].height, store.dop_grids[level].width)
         assert np.array_equal(found[1], image[1])
         assert np.array_equal(found[0], image[0])
@@ -215,28 +215,12 @@ def test_windows_anywhere_are_cut_from_the_whole_level(lossy, data, level):
         width, height = data.draw(st.integers(1, grid.width - column)), data.draw(st.integers(1, grid.height - row))
         window, at = PixelWindow(column, row, width, height), np.s_[row : row + height, column : column + width]
         if kind is store._dop:
-            for part, all_of_it in zip(
-                kind.read_image(level, window), kind.read_image(level, whole(grid)), strict=True
-            ):
-                assert np.array_equal(part, all_of_it[at])
+            for read in (kind.read_rgb, kind.read_grey):
+                for part, all_of_it in zip(read(level, window), read(level, whole(grid)), strict=True):
+                    assert np.array_equal(part, all_of_it[at])
         else:
             part, all_of_it = kind.read_heights(level, window), kind.read_heights(level, whole(grid))
             assert np.array_equal(part, all_of_it[at], equal_nan=True)
-
-
-def test_windows_in_strips_are_the_same(lossy, monkeypatch):
-    _, store = lossy
-    for level in range(1, LEVELS):
-        image = store._dop.read_image(level, whole(store.dop_grids[level]))
-        heights = store._dsm.read_heights(level, whole(store.dsm_grids[level]))
-        for limit in (1, 20_000):
-            monkeypatch.setattr(layer, "_STRIP_PX", limit)
-            again = store._dop.read_image(level, whole(store.dop_grids[level]))
-            assert all(map(np.array_equal, image, again))
-            assert np.array_equal(
-                store._dsm.read_heights(level, whole(store.dsm_grids[level])), heights, equal_nan=True
-            )
-        monkeypatch.undo()
 
 
 def test_window_of_a_level_that_is_not_stored_lies_where_it_should(tmp_path):
@@ -247,12 +231,12 @@ def test_window_of_a_level_that_is_not_stored_lies_where_it_should(tmp_path):
     pack = packs.write_pack(tmp_path / "pack", rgb, heights, max_z_error_m=0.0)
     west, _, _, north = packs.DOP_LATTICE.grid(pack.manifest.dop.tiles[0].box).bounds
     with MapStore(pack) as store:
-        window = store.read((west + 10.3, north - 61.2, west + 51.7, north - 20.9), 0.5)
-    assert window.dop_grid.dx == 0.5
-    centres = window.dop_grid.map_from_px([[0.0, 0.0], [7.0, 3.0]])
+        window = store.read_colour((west + 10.3, north - 61.2, west + 51.7, north - 20.9), 0.5)
+    assert window.grid.dx == 0.5
+    centres = window.grid.map_from_px([[0.0, 0.0], [7.0, 3.0]])
     for (x, y), (column, row) in zip(centres, ((0, 0), (7, 3)), strict=True):
         expected = np.array([(x - west) / 0.25 - 0.5, (north - y) / 0.25 - 0.5])
-        assert np.abs(window.dop[row, column, :2] - expected).max() <= 0.5
+        assert np.abs(window.rgb[row, column, :2] - expected).max() <= 0.5
 
 
 # -- packs of version 2 --------------------------------------------------------------------------------
@@ -278,9 +262,9 @@ def test_an_old_pack_with_all_levels_opens(tmp_path):
     tile = opened.manifest.dop.tiles[0]
     with MapStore(opened) as before, MapStore(new) as after:
         for level in range(LEVELS):
-            there = before._dop.read_image(level, whole(before.dop_grids[level]))
+            there = before._dop.read_rgb(level, whole(before.dop_grids[level]))
             # Lossless, so that the stored means are those of what is stored.
-            assert all(map(np.array_equal, there, after._dop.read_image(level, whole(after.dop_grids[level]))))
+            assert all(map(np.array_equal, there, after._dop.read_rgb(level, whole(after.dop_grids[level]))))
             found = before._dsm.read_heights(level, whole(before.dsm_grids[level]))
             assert np.isnan(found).any()
             assert np.array_equal(found, after._dsm.read_heights(level, whole(after.dsm_grids[level])), equal_nan=True)

@@ -65,7 +65,7 @@ def shown(store):
     """By level: DOP, validity, heights of all tiles."""
     found = []
     for dop, dsm in zip(store.dop_grids, store.dsm_grids, strict=True):
-        rgb, valid = store._dop.read_image(len(found), PixelWindow(0, 0, dop.width, dop.height))
+        rgb, valid = store._dop.read_rgb(len(found), PixelWindow(0, 0, dop.width, dop.height))
         found.append((rgb, valid, store._dsm.read_heights(len(found), PixelWindow(0, 0, dsm.width, dsm.height))))
     return found
 

@@ -7,6 +7,7 @@ import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import cv2
 import msgspec
 import numpy as np
 import packs
@@ -19,6 +20,7 @@ from rasterio.io import MemoryFile
 from ortholoc_edge.errors import MapError
 from ortholoc_edge.geometry.grid import bilinear
 from ortholoc_edge.tiles import encode, store
+from ortholoc_edge.tiles.cache import BlockCache
 from ortholoc_edge.tiles.cog import MAX_HANDLES, Cog, PixelWindow
 from ortholoc_edge.tiles.lattice import LEVELS, PixelBox
 from ortholoc_edge.tiles.levels import STORED_LEVELS, halved_heights, halved_image
@@ -103,7 +105,7 @@ def everything(opened, level=0):
     """(DOP, validity, DSM) of all tiles."""
     dop, dsm = opened.dop_grids[level], opened.dsm_grids[level]
     return (
-        *opened._dop.read_image(level, PixelWindow(0, 0, dop.width, dop.height)),
+        *opened._dop.read_rgb(level, PixelWindow(0, 0, dop.width, dop.height)),
         opened._dsm.read_heights(level, PixelWindow(0, 0, dsm.width, dsm.height)),
     )
 
@@ -136,7 +138,7 @@ def test_any_window_is_that_of_the_whole_raster(sound, whole, data, level):
         width = data.draw(st.integers(1, grid.width - column))
         window = PixelWindow(column, row, width, data.draw(st.integers(1, grid.height - row)))
         if one is whole[0]:
-            rgb, valid = opened.read_image(level, window)
+            rgb, valid = opened.read_rgb(level, window)
             expected, mask = averaged_image(one, level, window)
             assert same(valid, mask)
             assert same(rgb[valid], expected[mask])
@@ -203,7 +205,7 @@ def test_window_covers_the_region_and_no_pixel_more(sound, corner, size, gsd):
         assert min(inside[2] - inside[0], inside[3] - inside[1]) < 1e-5
         return
     grid, slack = window.dop_grid, 1e-5
-    assert window.dop.shape == (grid.height, grid.width, 3)
+    assert window.dop_grey.shape == (grid.height, grid.width)
     assert window.dsm.shape == (window.dsm_grid.height, window.dsm_grid.width)
     outer = grid.bounds
     assert outer[0] <= inside[0] + slack < outer[0] + grid.dx + 2 * slack
@@ -215,8 +217,8 @@ def test_window_covers_the_region_and_no_pixel_more(sound, corner, size, gsd):
     whole_grid = sound.dop_grids[level]
     column, row = (round(v) for v in ((grid.west - WEST) / grid.dx, (grid.top - NORTH) / grid.dy))
     assert grid == whole_grid.crop(column, row, grid.width, grid.height)
-    rgb, valid = sound._dop.read_image(level, PixelWindow(column, row, grid.width, grid.height))
-    assert same(window.dop, rgb)
+    grey, valid = sound._dop.read_grey(level, PixelWindow(column, row, grid.width, grid.height))
+    assert same(window.dop_grey, grey)
     assert same(window.dop_valid, valid)
     # The surface model reaches beyond the orthophoto's pixel centres, for bilinear look-ups.
     cells = window.dsm_grid.px_from_map(grid.map_from_px([[0, 0], [grid.width - 1, grid.height - 1]]))
@@ -257,7 +259,7 @@ def test_too_large_a_window_is_refused(pack):
 
 def test_arrays_cannot_be_changed_by_a_consumer(sound):
     window = sound.read((WEST, SOUTH, WEST + 140, SOUTH + 140), 0.25)
-    for array in (window.dop, window.dop_valid, window.dsm):
+    for array in (window.dop_grey, window.dop_valid, window.dsm):
         assert not array.flags.writeable
         assert array.flags.c_contiguous
 
@@ -293,13 +295,30 @@ def test_several_threads_read_what_one_does(pack):
 
     def read(opened, request):
         window = opened.read(*request)
-        return window.dop, window.dop_valid, window.dsm, opened.heights(corners)
+        return window.dop_grey, window.dop_valid, window.dsm, opened.heights(corners)
 
     with MapStore(pack) as one, MapStore(pack) as other, ThreadPoolExecutor(8) as pool:
         alone = [read(one, request) for request in requests]
         together = list(pool.map(lambda request: read(other, request), requests))
     for a, b in zip(alone, together, strict=True):
         assert all(map(same, a, b))
+
+
+@pytest.fixture
+def decoded(monkeypatch):
+    """Blocks in the order in which they are decoded: (file, level, column, row)."""
+    found = []
+
+    def listed(read):
+        def reading(cog, level, window):
+            found.append((cog.path.parent.name, cog.path.name, level, window.column, window.row))
+            return read(cog, level, window)
+
+        return reading
+
+    for name in ("read_image", "read_heights"):
+        monkeypatch.setattr(Cog, name, listed(getattr(Cog, name)))
+    return found
 
 
 def test_open_handles_are_bounded(pack, monkeypatch):
@@ -311,33 +330,59 @@ def test_open_handles_are_bounded(pack, monkeypatch):
         for level in (*range(LEVELS), 0):
             everything(opened, level)
             assert len(opened._dop._handles) == min(MAX_HANDLES, len(opened_levels))
-        # The same view again opens nothing.
-        region = (WEST + 90, SOUTH + 90, WEST + 190, SOUTH + 170)
-        opened.read(region, 0.25)
-        opened.heights(DSM_GRID.map_from_px([[150.0, 150.0]]))
-        count = len(opened_levels)
-        opened.read(region, 0.25)
-        opened.heights(DSM_GRID.map_from_px([[150.0, 150.0]]))
-        assert len(opened_levels) == count
         handles = opened._dop._handles
     assert len(handles) == 0
 
 
-def test_what_two_reads_did_not_use_is_closed_and_can_be_read_again(pack):
-    first, other = (WEST + 10, SOUTH + 10, WEST + 40, SOUTH + 40), (WEST + 150, SOUTH + 120, WEST + 190, SOUTH + 160)
+@pytest.mark.parametrize("gsd_m", [0.25, 0.5, 1.0, 2.0, 4.0])
+def test_what_was_seen_before_is_not_decoded_again(pack, decoded, gsd_m):
+    """Of a level that is stored or averaged; also not what only the frame before the last saw."""
+    reach = min(240 * gsd_m, 120.0)
+    first, other = ((x, SOUTH + 20, x + reach, SOUTH + 20 + reach) for x in (WEST + 10, WEST + 10 + 0.6 * reach))
     with MapStore(pack) as opened:
-        before = opened.read(first, 0.25)
-        # Levels of the tiles under another place are opened, and the first ones kept for a turn.
-        opened.read(other, 2.0)
-        handles = opened._dop._handles
-        count = len(handles)
-        kept = list(handles._open)
-        opened.read(other, 2.0)
-        opened.read(other, 2.0)
-        assert len(handles) < count
-        assert set(handles._open) < set(kept)
-        again = opened.read(first, 0.25)
-        assert same(before.dop, again.dop) and same(before.dsm, again.dsm)
+        windows = [opened.read(bounds, gsd_m) for bounds in (first, other)]
+        opened.heights(DSM_GRID.map_from_px([[150.0, 150.0]]), 2 * gsd_m)
+        assert len(decoded) == len(set(decoded)) > 0
+        count = len(decoded)
+        again = [opened.read(bounds, gsd_m) for bounds in (first, other)]
+        opened.heights(DSM_GRID.map_from_px([[150.0, 150.0]]), 2 * gsd_m)
+        assert len(decoded) == count
+        opened.forget_decoded()
+        opened.read(first, gsd_m)
+        assert len(decoded) > count
+    for before, after in zip(windows, again, strict=True):
+        assert same(before.dop_grey, after.dop_grey)
+        assert same(before.dop_valid, after.dop_valid)
+        assert same(before.dsm, after.dsm)
+
+
+def test_a_level_that_is_not_stored_is_held_as_it_is(pack, decoded):
+    """Not as the four times as many pixels that it was averaged from."""
+    with MapStore(pack) as opened:
+        grid = opened.dop_grids[1]
+        grey, valid = opened._dop.read_grey(1, PixelWindow(0, 0, grid.width, grid.height))
+        assert {level for _, _, level, _, _ in decoded} == {0}
+        assert grey.nbytes <= opened._cache.bytes <= grey.nbytes + valid.nbytes
+
+
+def test_grey_is_that_of_the_colours(sound):
+    for level, grid in enumerate(sound.dop_grids):
+        window = PixelWindow(0, 0, grid.width, grid.height)
+        rgb, valid = sound._dop.read_rgb(level, window)
+        grey, grey_valid = sound._dop.read_grey(level, window)
+        assert same(grey, cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
+        assert same(valid, grey_valid)
+        assert not valid.all() or level == LEVELS - 1
+        seen = sound.read_colour(grid.bounds, grid.gsd_m)
+        assert same(seen.rgb, rgb)
+        assert same(seen.valid, valid)
+        assert seen.grid == grid
+
+
+def test_colours_of_a_region_outside_or_too_large(pack, sound):
+    assert sound.read_colour((WEST - 50, SOUTH, WEST - 1, NORTH), 0.25) is None
+    with MapStore(pack, max_pixels=100_000) as opened, pytest.raises(WindowTooLargeError, match="exceeds 100000 px"):
+        opened.read_colour(opened.bounds, 0.25)
 
 
 def test_bytes_in_memory_are_not_copied_for_gdal():
@@ -350,10 +395,37 @@ def test_bytes_in_memory_are_not_copied_for_gdal():
         assert resident() - before < 16_000_000
 
 
-def test_cache_is_bounded_and_memory_is_the_files(pack):
-    with MapStore(pack, cache_bytes=3 * 2**20) as opened:
-        assert get_gdal_config("GDAL_CACHEMAX") == 3 * 2**20
+@pytest.mark.parametrize("limit", [1, 300_000, 600_000])
+def test_cache_is_bounded_and_memory_is_the_files(pack, sound, limit):
+    with MapStore(pack, cache_bytes=limit) as opened:
+        # What is decoded is held once: not by GDAL too.
+        assert int(get_gdal_config("GDAL_CACHEMAX")) <= 2**20
         assert opened.compressed_bytes == sum(path.stat().st_size for path in pack.path.glob("d*/*.tif"))
+        for level, (grid, dsm_grid) in enumerate(zip(sound.dop_grids, sound.dsm_grids, strict=True)):
+            whole_dop = PixelWindow(0, 0, grid.width, grid.height)
+            whole_dsm = PixelWindow(0, 0, dsm_grid.width, dsm_grid.height)
+            assert all(map(same, opened._dop.read_grey(level, whole_dop), sound._dop.read_grey(level, whole_dop)))
+            assert same(opened._dsm.read_heights(level, whole_dsm), sound._dsm.read_heights(level, whole_dsm))
+            assert opened._cache.bytes <= limit
+        assert (len(opened._cache) > 0) == (limit > 1)
+        cache = opened._cache
+    assert (len(cache), cache.bytes) == (0, 0)
+
+
+def test_block_used_longest_ago_goes_first():
+    cache = BlockCache(300)
+    for key in "abc":
+        cache.put(key, (np.zeros(60, np.uint8), np.zeros(10, np.float32)))
+    assert cache.bytes == 300
+    assert cache.get("a") is not None
+    cache.put("d", (np.zeros(150, np.uint8),))
+    assert [key for key in "abcd" if cache.get(key) is not None] == ["a", "d"]
+    assert cache.bytes == 250
+    cache.put("e", (np.zeros(301, np.uint8),))
+    assert (len(cache), cache.bytes) == (0, 0)
+    # One value that stands for all takes no memory to speak of.
+    cache.put("f", (np.broadcast_to(np.True_, (500, 500)),))
+    assert (len(cache), cache.bytes) == (1, 1)
 
 
 def test_pack_over_the_budget_is_refused_before_anything_is_read(pack, monkeypatch):
