@@ -83,10 +83,18 @@ class View:
 
 
 class Renderer:
-    """Draws one scene. Not for several threads at once."""
+    """Draws one scene. Not for several threads at once.
 
-    def __init__(self, scene: Scene, placement: Placement, sensor: Sensor | None = None) -> None:
+    Args:
+        level_by_pixel: every pixel is drawn from texels of its own size on the ground, and not all from those of a
+            typical pixel: for views with near and far ground.
+    """
+
+    def __init__(
+        self, scene: Scene, placement: Placement, sensor: Sensor | None = None, *, level_by_pixel: bool = False
+    ) -> None:
         self.scene, self.placement, self.sensor = scene, placement, sensor or Sensor()
+        self._level_by_pixel = level_by_pixel
         gsd = scene.spec.gsd_m
         # Cells are whole texels: 0.5 m of 0.2 m texels are cells of 0.4 m.
         blocks = [max(1, round(cell / gsd)) for cell in _CELLS_M]
@@ -152,12 +160,10 @@ class Renderer:
         top = self._nearest(scene.surface, x + a * nudge, y + b * nudge)
         low = self._nearest(scene.surface, *ray.xy(np.minimum(before, descent)))
         wall = (ids > 0) & (ids < FIRST_TREE) & (top - z > 0.25) & (top - low > 0.8)
-        level = int(
-            np.clip(
-                np.floor(np.log2(max(1e-6, float(np.median(descent)) / camera.focal_px / scene.spec.gsd_m)) + 0.2), 0, 3
-            )
-        )
-        colours = self._textured(level, x, y)
+        if self._level_by_pixel:
+            colours = self._textured_by_pixel(self._levels(descent * np.sqrt(1.0 + a * a + b * b), camera), x, y)
+        else:
+            colours = self._textured(int(self._levels(np.asarray(np.median(descent)), camera)), x, y)
         self._paint_walls(colours, wall, ids, x, y, z)
         crown = (ids >= FIRST_TREE) & (ids < FIRST_CAR)
         depth = np.clip(1.0 - 0.10 * (top - z), 0.55, 1.0)
@@ -224,6 +230,18 @@ class Renderer:
 
     def _bilinear(self, raster: AnyArray, x: Float32Array, y: Float32Array) -> AnyArray:
         return _remapped(raster, *self._pixels(x, y, self.scene.spec.gsd_m), cv2.INTER_LINEAR)
+
+    def _levels(self, distance_m: AnyArray, camera: Camera) -> AnyArray:
+        """Of the textures, for what is so far away."""
+        texels = np.maximum(1e-6, distance_m.astype(np.float64) / camera.focal_px / self.scene.spec.gsd_m)
+        return np.clip(np.floor(np.log2(texels) + 0.2), 0, len(self._textures) - 1).astype(np.intp)
+
+    def _textured_by_pixel(self, levels: AnyArray, x: Float32Array, y: Float32Array) -> ImageArray:
+        colours = np.empty((len(x), 3), dtype=np.uint8)
+        for level in np.unique(levels):
+            at = np.flatnonzero(levels == level)
+            colours[at] = self._textured(int(level), x[at], y[at])
+        return colours
 
     def _textured(self, level: int, x: Float32Array, y: Float32Array) -> ImageArray:
         u, v = self._pixels(x, y, self.scene.spec.gsd_m)

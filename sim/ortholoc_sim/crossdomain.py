@@ -10,7 +10,8 @@ OrthoLoC paper:
     xDOPDSM  both layers of the map are older and coarser than the photos: buildings new or gone, more trees
              felled, the others grown, the DSM smoothed and noisy
 
-Place, map and poses follow from the seed alone, so the kinds of one seed differ in nothing else.
+Place, map and poses follow from the seed alone, so the kinds of one seed differ in nothing else. How the photos are
+flown is a `Flight`: tilt, height, and the light that the camera is made for.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from ortholoc_edge.tiles.georeference import Georeference, VerticalDatum
 from ortholoc_sim.camera import Placement, Renderer, Sensor, View
 from ortholoc_sim.country import FRAME
 from ortholoc_sim.detail import Detail
-from ortholoc_sim.epoch import Epoch
+from ortholoc_sim.epoch import Epoch, near_infrared
 from ortholoc_sim.layout import FLAT_COLOURS, ROOF_COLOURS, Building, Layout
 from ortholoc_sim.lens import Exposure
 from ortholoc_sim.photos import COLUMNS, flight_row
@@ -53,10 +54,13 @@ from ortholoc_sim.world import FIRST_TREE, Cover, Scene, WorldSpec, build_scene
 DOP_GSD_M, DSM_GSD_M = 0.2, 1.0
 WIDTH_PX, HEIGHT_PX = 640, 480
 _FOCAL_PX = (500.0, 700.0)
-_HEIGHT_AGL_M = (60.0, 150.0)
 _MAX_TILT_DEG = 45.0
 # Of the beta distribution of tilts: 7 % are above 30 degrees, the median is 13.
 _TILT_SHAPE = (1.3, 2.9)
+_MOST_TILTED_DEG = 80.0
+# Of an oblique photo that lies inside the place: what is nearer than so many heights above ground. Beyond, the place
+# may end.
+_NEAR_HEIGHTS = 4.0
 _ROLL_SIGMA_DEG = 2.5
 # Of a photo's ground width: so far from the border is the middle of what it shows.
 _BORDER_FOOTPRINTS = 1.2
@@ -82,6 +86,38 @@ class Kind(StrEnum):
     SAME = "same"
     XDOP = "xDOP"
     XDOPDSM = "xDOPDSM"
+
+
+class Spectrum(StrEnum):
+    """Light that the photos' camera sees. The map is of visible light always."""
+
+    VISIBLE = "visible"
+    NIR = "nir"
+
+
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """How photos are taken.
+
+    Attributes:
+        height_m: least and most above ground.
+        tilt_deg: least and most from straight down, all alike likely; None: up to 45 degrees, mostly little. From
+            some 60 degrees on there is sky in the photos.
+        spectrum: near infrared is one channel, written as grey.
+    Raises: ValueError if least is more than most, or a photo may lie on the ground or show nothing but sky.
+    """
+
+    height_m: tuple[float, float] = (60.0, 150.0)
+    tilt_deg: tuple[float, float] | None = None
+    spectrum: Spectrum = Spectrum.VISIBLE
+
+    def __post_init__(self) -> None:
+        if not 0 < self.height_m[0] <= self.height_m[1]:
+            raise ValueError(f"height above ground from {self.height_m[0]:g} to {self.height_m[1]:g} m")
+        if self.tilt_deg is not None and not 0 <= self.tilt_deg[0] <= self.tilt_deg[1] <= _MOST_TILTED_DEG:
+            raise ValueError(
+                f"tilt from {self.tilt_deg[0]:g} to {self.tilt_deg[1]:g} degrees, of at most {_MOST_TILTED_DEG:g}"
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,6 +162,7 @@ class CrossDomain:
     width_m: float = 1200.0
     height_m: float = 1000.0
     gsd_m: float = 0.125
+    flown_as: Flight = Flight()
 
     @cached_property
     def place(self) -> Place:
@@ -172,12 +209,22 @@ class CrossDomain:
         return build_scene(replace(self.place.world, layout=survey_layout(self.place)), self.survey)
 
     def flight_scene(self) -> Scene:
-        """The place when the photos were taken."""
+        """The place when the photos were taken, in the light that they show."""
         if self.kind is Kind.SAME:
-            return self.survey_scene()
-        return build_scene(
-            replace(self.place.world, layout=flight_layout(self.place, self.kind, self.flight)), self.flight
-        )
+            layout = survey_layout(self.place)
+        else:
+            layout = flight_layout(self.place, self.kind, self.flight)
+        epoch = near_infrared(self.flight) if self._is_infrared else self.flight
+        return build_scene(replace(self.place.world, layout=layout), epoch)
+
+    @property
+    def looks_surveyed(self) -> bool:
+        """Whether the photos show the map's own picture: `flight_scene` is `survey_scene`."""
+        return self.kind is Kind.SAME and not self._is_infrared
+
+    @property
+    def _is_infrared(self) -> bool:
+        return self.flown_as.spectrum is Spectrum.NIR
 
     def layers(self, scene: Scene, surface: Float32Array) -> MapLayers:
         """The map: its DOP of the scene of ``survey``, its DSM of the ``surface`` of a scene: the flight's for xDOP,
@@ -223,7 +270,9 @@ class CrossDomain:
 
     def renderer(self, scene: Scene) -> Renderer:
         """Of clean pictures: the sensor's flaws are `Exposure`'s."""
-        return Renderer(scene, self.placement, Sensor(1.0, 0.0, 0.0, 0.0, 0))
+        return Renderer(
+            scene, self.placement, Sensor(1.0, 0.0, 0.0, 0.0, 0), level_by_pixel=self.flown_as.tilt_deg is not None
+        )
 
     def photo(self, renderer: Renderer, map_from_camera: Rigid3, index: int) -> Photo:
         """Photo ``index`` of the flight, before JPEG."""
@@ -231,16 +280,19 @@ class CrossDomain:
         eye, axis = map_from_camera.translation, map_from_camera.rotation[:, 2]
         distance_m = (eye[2] - float(np.nanmedian(view.points_map[..., 2]))) / -axis[2]
         clean = self._detail.added(view, np.array([self.place.west_m, self.place.south_m]), distance_m / self.camera.fx)
+        if self._is_infrared:
+            clean = np.repeat(clean[..., :1], 3, axis=2)
         image = self.exposure(index).expose(clean, self.camera, np.random.default_rng([self.seed, 113, index]))
         return Photo(image, self._lasting_share(view))
 
     def _lasting_share(self, view: View) -> float:
         world = self.place.world
-        local = view.points_map[..., :2] - (self.place.west_m, self.place.south_m)
+        ground = np.isfinite(view.points_map[..., 2])
+        local = np.nan_to_num(view.points_map[..., :2]) - (self.place.west_m, self.place.south_m)
         u, v = np.round(world.spec.grid.px_from_map(local)).astype(int).transpose(2, 0, 1)
         cover = world.cover[np.clip(v, 0, world.cover.shape[0] - 1), np.clip(u, 0, world.cover.shape[1] - 1)]
         house = (view.objects > 0) & (view.objects < FIRST_TREE)
-        return float((house | ((view.objects == 0) & np.isin(cover, _LASTING))).mean())
+        return float((house | (ground & (view.objects == 0) & np.isin(cover, _LASTING))).mean())
 
     def exposure(self, index: int) -> Exposure:
         """The camera of the flight with the settings of one photo."""
@@ -249,8 +301,11 @@ class CrossDomain:
 
     def _drawn(self, rng: np.random.Generator) -> Rigid3:
         xy = rng.uniform((0.0, 0.0), (self.width_m, self.height_m))
-        height_m = rng.uniform(*_HEIGHT_AGL_M)
-        tilt_deg = _MAX_TILT_DEG * rng.beta(*_TILT_SHAPE)
+        height_m = rng.uniform(*self.flown_as.height_m)
+        if self.flown_as.tilt_deg is None:
+            tilt_deg = _MAX_TILT_DEG * rng.beta(*_TILT_SHAPE)
+        else:
+            tilt_deg = rng.uniform(*self.flown_as.tilt_deg)
         roll, yaw = np.radians(rng.normal(0.0, _ROLL_SIGMA_DEG)), rng.uniform(-np.pi, np.pi)
         # From grid north: the map's axes stand in for north, east, down.
         ned_from_body = rotation.from_euler(float(roll), float(np.radians(tilt_deg)), float(yaw))
@@ -269,6 +324,8 @@ class CrossDomain:
         ends = np.array([[0, 0], [WIDTH_PX - 1, 0], [WIDTH_PX - 1, HEIGHT_PX - 1], [0, HEIGHT_PX - 1]])
         px = np.concatenate([ends, [[camera.cx, camera.cy]]])
         rays = camera.unproject(px) @ pose.rotation.T
+        if self.flown_as.tilt_deg is not None:
+            return self._near_part_inside(pose, rays)
         if (rays[:, 2] > -0.1 * np.linalg.norm(rays, axis=1)).any():
             return False
         eye = pose.translation - (place.west_m, place.south_m, 0.0)
@@ -279,6 +336,15 @@ class CrossDomain:
         size = np.array([self.width_m, self.height_m])
         room = np.minimum(ground, size - ground).min(axis=1)
         return bool((room[:4] > _EDGE_M).all() and room[4] > _BORDER_FOOTPRINTS * footprint_m)
+
+    def _near_part_inside(self, pose: Rigid3, rays: FloatArray) -> bool:
+        """Whether an oblique view's rays (N, 3) end inside the place, or have gone `_NEAR_HEIGHTS` heights inside."""
+        eye = pose.translation - (self.place.west_m, self.place.south_m, 0.0)
+        depth_m = eye[2] - self._ground(eye[:2])
+        reach = depth_m / np.maximum(-rays[:, 2], np.linalg.norm(rays[:, :2], axis=1) / _NEAR_HEIGHTS)
+        ground = np.vstack([eye[:2], eye[:2] + rays[:, :2] * reach[:, None]])
+        room = np.minimum(ground, np.array([self.width_m, self.height_m]) - ground)
+        return bool((room > _EDGE_M).all())
 
 
 def survey_layout(place: Place) -> Layout:
@@ -335,7 +401,7 @@ def write_set(out: Path, domain: CrossDomain, count: int, progress: bool = False
     (out / "queries").mkdir(parents=True, exist_ok=True)
     name = out.resolve().name
     scene = domain.survey_scene()
-    flown = scene if domain.kind is Kind.SAME else domain.flight_scene()
+    flown = scene if domain.looks_surveyed else domain.flight_scene()
     _write_layers(out, name, domain.layers(scene, (flown if domain.kind is Kind.XDOP else scene).surface))
     scene = flown  # the survey's half gigabyte is done with
     renderer = domain.renderer(scene)
@@ -409,12 +475,22 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--kind", type=Kind, choices=list(Kind), default=Kind.XDOP, help="what lies between (default: %(default)s)"
     )
+    parser.add_argument("--height", type=float, nargs=2, default=Flight().height_m, metavar=("MIN", "MAX"), help="of "
+                        "the photos above ground, m (default: 60 150)")  # fmt: skip
+    parser.add_argument("--tilt", type=float, nargs=2, metavar=("MIN", "MAX"), help="of the camera from straight down, "
+                        "degrees; far ground and sky may be in view (default: mostly little, at most 45)")  # fmt: skip
+    parser.add_argument("--spectrum", type=Spectrum, choices=list(Spectrum), default=Spectrum.VISIBLE, help="of the "
+                        "photos; the map's is visible light (default: %(default)s)")  # fmt: skip
     parser.add_argument("--photos", type=int, default=100, help="how many (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="of place, looks and poses (default: %(default)s)")
     parser.add_argument("--sheets", type=int, default=0, metavar="N", help="write PNGs of the first N photos beside "
                         "their map to OUT/sheets (default: %(default)s)")  # fmt: skip
     options = parser.parse_args(arguments)
-    domain = CrossDomain(options.kind, options.seed)
+    try:
+        flight = Flight(tuple(options.height), options.tilt and tuple(options.tilt), options.spectrum)
+    except ValueError as err:
+        parser.error(str(err))
+    domain = CrossDomain(options.kind, options.seed, flown_as=flight)
     write_set(options.out, domain, options.photos, progress=True)
     if options.sheets:
         (options.out / "sheets").mkdir(exist_ok=True)

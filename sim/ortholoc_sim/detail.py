@@ -48,12 +48,14 @@ class Detail:
             origin_m: (2,) a corner near the view, so that float32 resolves its positions.
             gsd_m: size of a pixel on the ground; noise below it would only flicker, and is left out.
         """
-        points = view.points_map - (origin_m[0], origin_m[1], 0.0)
+        # The sky has no place, and no detail.
+        sky = np.isnan(view.points_map[..., 2])
+        points = np.where(sky[..., None], 0.0, view.points_map - (origin_m[0], origin_m[1], 0.0))
         x, y, z = (np.asarray(points[..., k], dtype=np.float32) for k in range(3))
         crown = (view.objects >= FIRST_TREE) & (view.objects < FIRST_CAR)
         factor = np.ones(x.shape, dtype=np.float32)
         flat = np.zeros_like(z)
-        ground, roof = view.objects == 0, (view.objects > 0) & (view.objects < FIRST_TREE) & ~view.facade
+        ground, roof = (view.objects == 0) & ~sky, (view.objects > 0) & (view.objects < FIRST_TREE) & ~view.facade
         for mask, octaves, height, slides in (
             (ground, _GROUND, flat, _SLIDES[:1]), (roof, _ROOFS, flat, _SLIDES[:1]), (crown, self._crowns, z, _SLIDES)
         ):  # fmt: skip

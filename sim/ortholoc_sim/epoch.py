@@ -175,3 +175,37 @@ def standing(layout: Layout, epoch: Epoch) -> Standing:
         grown = 1.15 if fate < epoch.changed else 1.03
         trees.append(replace(tree, radius_m=tree.radius_m * grown, height_m=tree.height_m * grown))
     return Standing(tuple(buildings), tuple(trees), cars)
+
+
+# Red light, times this, is what bare things reflect in the near infrared; plants add to it by how green they are.
+_INFRARED_OF_RED, _INFRARED_OF_GREEN = 1.1, 600.0
+_INFRARED_WATER = 14.0
+# The blue sky that lights the shade has next to no infrared.
+_INFRARED_SHADE = 0.6
+
+
+def near_infrared(epoch: Epoch) -> Epoch:
+    """The same time seen in near infrared: plants bright by how green they are ((G - R) / (G + R)), water black. Its
+    first channel is the picture; roofs and ways keep their red there."""
+
+    def seen(colour: Rgb) -> Rgb:
+        red, green, _ = colour
+        value = _INFRARED_OF_RED * red + _INFRARED_OF_GREEN * max(0.0, (green - red) / (green + red))
+        return (min(value, 240.0),) * 3
+
+    def dim(light: Rgb) -> Rgb:
+        return light[0] * _INFRARED_SHADE, light[1] * _INFRARED_SHADE, light[2] * _INFRARED_SHADE
+
+    shade, sunlit = dim(epoch.ambient), np.add(epoch.ambient, epoch.direct)
+    spread = 0.5 * max(epoch.leaves_spread)
+    return replace(
+        epoch,
+        ambient=shade,
+        direct=(float(sunlit[0] - shade[0]), float(sunlit[1] - shade[1]), float(sunlit[2] - shade[2])),
+        crops={crop: replace(look, colour=seen(look.colour)) for crop, look in epoch.crops.items()},
+        grass=seen(epoch.grass),
+        leaves=seen(epoch.leaves),
+        leaves_spread=(spread,) * 3,
+        needles=seen(epoch.needles),
+        water=(_INFRARED_WATER,) * 3,
+    )

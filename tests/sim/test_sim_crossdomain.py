@@ -16,7 +16,9 @@ from ortholoc_sim.crossdomain import (
     HEIGHT_PX,
     WIDTH_PX,
     CrossDomain,
+    Flight,
     Kind,
+    Spectrum,
     contact_sheet,
     flight_layout,
     main,
@@ -24,12 +26,15 @@ from ortholoc_sim.crossdomain import (
     write_set,
 )
 from ortholoc_sim.detail import Detail
-from ortholoc_sim.layout import Building
+from ortholoc_sim.epoch import SURVEY, near_infrared
+from ortholoc_sim.layout import Building, Crop
 from ortholoc_sim.lens import Exposure
+from ortholoc_sim.noise import grain
 from ortholoc_sim.season import other_time, survey_time
-from ortholoc_sim.world import FIRST_PARCEL, FIRST_TREE, Scene, WorldSpec, base_height
+from ortholoc_sim.world import FIRST_PARCEL, FIRST_TREE, Cover, Scene, WorldSpec, base_height
 
 from ortholoc_edge.bench import sequence
+from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.grid import bilinear
 from ortholoc_edge.geometry.rigid import Rigid3
@@ -408,6 +413,83 @@ def test_detail_is_tied_to_places_and_gone_from_high_up() -> None:
 def test_too_small_a_place_is_refused() -> None:
     with pytest.raises(ValueError, match="no room for photos"):
         replace(SMALL, width_m=160.0, height_m=160.0).poses(3)
+
+
+def test_oblique_flight_is_tilted_as_asked_and_shows_sky_and_the_place(flown: Scene) -> None:
+    domain = replace(SMALL, flown_as=Flight((20.0, 40.0), (60.0, 70.0)))
+    renderer, skies = domain.renderer(flown), []
+    for k, pose in enumerate(domain.poses(4)):
+        # The roll tilts it, too.
+        assert 60.0 <= np.degrees(np.arccos(-pose.rotation[2, 2])) <= 71.0
+        local = pose.translation - (domain.place.west_m, domain.place.south_m, 0.0)
+        ground_m = bilinear(flown.terrain, flown.spec.grid.px_from_map(local[None, :2]))[0]
+        assert 19.5 <= local[2] - ground_m <= 40.5
+        photo, view = domain.photo(renderer, pose, k), renderer.view(domain.camera, pose)
+        sky = np.isnan(view.points_map[..., 2])
+        skies.append(sky.mean())
+        near = view.points_map[-1, :, :2] - (domain.place.west_m, domain.place.south_m)
+        assert not sky[-1].any() and ((near > 0) & (near < (domain.width_m, domain.height_m))).all()
+        assert 0.0 <= photo.lasting_share < 1.0
+        if sky.any():  # without detail of the ground
+            assert photo.image[sky].std(axis=0).max() < 15.0
+    assert 0.0 < max(skies) < 0.6
+
+
+def test_far_ground_is_averaged_and_near_ground_is_sharp() -> None:
+    spec = WorldSpec(0, 240.0, 240.0, 0.1)
+    noise = np.clip(128.0 + 40.0 * grain(spec.shape, 1), 0, 255).astype(np.uint8)
+    flat, ids = np.zeros(spec.shape, np.float32), np.zeros(spec.shape, np.uint16)
+    scene = Scene(spec, SMALL.survey, cv2.merge([noise] * 3), flat, flat, ids, (), (), ())
+    pose = Rigid3(rotation.exp([np.radians(180.0 + 68.0), 0.0, 0.0]), np.array([120.0, 5.0, 40.0]))
+    camera, sensor = SMALL.camera, Sensor(1.0, 0.0, 0.0, 0.0, 0)
+    plain, fitted = (
+        Renderer(scene, Placement(0.0, 0.0), sensor, level_by_pixel=by_pixel).render(camera, pose).astype(float)
+        for by_pixel in (False, True)
+    )
+    far, near = slice(130, 150), slice(HEIGHT_PX - 20, HEIGHT_PX)
+    assert fitted[far].std() < 0.8 * plain[far].std()
+    assert fitted[near].std() >= plain[near].std()
+
+
+def test_near_infrared_shows_plants_bright_and_water_black() -> None:
+    seen = near_infrared(SURVEY)
+    assert len(set(seen.leaves)) == len(set(seen.water)) == 1
+    for visible, infrared in ((SURVEY.leaves, seen.leaves), (SURVEY.needles, seen.needles), (SURVEY.grass, seen.grass)):
+        assert infrared[0] > 1.4 * visible[0]
+    ripe, bare = SURVEY.crops[Crop.WHEAT].colour, seen.crops[Crop.WHEAT].colour
+    assert bare[0] == pytest.approx(1.1 * ripe[0])  # nothing green
+    assert seen.water[0] < 0.3 * SURVEY.water[0]
+    # As bright in the sun, darker in the shade.
+    assert np.add(seen.ambient, seen.direct) == pytest.approx(np.add(SURVEY.ambient, SURVEY.direct))
+    assert seen.ambient[0] < 0.7 * SURVEY.ambient[0]
+
+
+def test_a_flight_in_near_infrared_is_the_same_but_for_its_colours(flown: Scene) -> None:
+    domain = replace(SMALL, flown_as=Flight(spectrum=Spectrum.NIR))
+    assert not replace(domain, kind=Kind.SAME).looks_surveyed
+    seen = domain.flight_scene()
+    np.testing.assert_array_equal(seen.surface, flown.surface)
+    np.testing.assert_array_equal(seen.objects, flown.objects)
+    house = (flown.objects > 0) & (flown.objects < FIRST_TREE)
+    water = domain.place.world.cover == Cover.WATER
+    assert np.median(seen.texture[water, 0]) < 25 < np.median(flown.texture[water, 0])
+    lit = house & (flown.texture[..., 0] > 100)
+    assert np.abs(seen.texture[lit, 0].astype(int) - flown.texture[lit, 0]).mean() < 15.0
+    photo = domain.photo(domain.renderer(seen), domain.poses(1)[0], 0).image.astype(int)
+    hue = photo - photo.mean(axis=2, keepdims=True)
+    assert np.abs(hue - hue.mean(axis=(0, 1))).mean() < 4.0  # the sensor's noise and white balance
+
+
+def test_a_flight_by_default_is_what_it_was() -> None:
+    """Sets that figures were measured on stay as they are."""
+    eye = SMALL.poses(2)[1].translation
+    np.testing.assert_allclose(eye, [715032.178516, 5547975.611068, 495.153685], atol=1e-5)
+
+
+@pytest.mark.parametrize("flight", [((0.0, 10.0), None), ((30.0, 10.0), None), ((10.0, 30.0), (20.0, 85.0))])
+def test_a_flight_that_can_not_be_is_refused(flight: tuple[tuple[float, float], tuple[float, float] | None]) -> None:
+    with pytest.raises(ValueError, match=r"height|tilt"):
+        Flight(*flight)
 
 
 def test_command_refuses_a_kind_that_is_none(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
