@@ -62,6 +62,10 @@ _MOST_TILTED_DEG = 80.0
 # may end.
 _NEAR_HEIGHTS = 4.0
 _ROLL_SIGMA_DEG = 2.5
+LAP_SPEED_M_S = 15.0
+# Half axes of a lap as parts of the place's sides; jitter of roll, pitch and yaw, 1-sigma.
+_LAP_PART = 0.25
+_LAP_JITTER_DEG = 1.0
 # Of a photo's ground width: so far from the border is the middle of what it shows.
 _BORDER_FOOTPRINTS = 1.2
 _EDGE_M = 15.0
@@ -104,14 +108,19 @@ class Flight:
         tilt_deg: least and most from straight down, all alike likely; None: up to 45 degrees, mostly little. From
             some 60 degrees on there is sky in the photos.
         spectrum: near infrared is one channel, written as grey.
+        spacing_m: from photo to photo along a lap round the place, at the middle of the heights and tilts, at
+            `LAP_SPEED_M_S`; None: every photo stands for itself.
     Raises: ValueError if least is more than most, or a photo may lie on the ground or show nothing but sky.
     """
 
     height_m: tuple[float, float] = (60.0, 150.0)
     tilt_deg: tuple[float, float] | None = None
     spectrum: Spectrum = Spectrum.VISIBLE
+    spacing_m: float | None = None
 
     def __post_init__(self) -> None:
+        if self.spacing_m is not None and not self.spacing_m > 0:
+            raise ValueError(f"{self.spacing_m:g} m from photo to photo")
         if not 0 < self.height_m[0] <= self.height_m[1]:
             raise ValueError(f"height above ground from {self.height_m[0]:g} to {self.height_m[1]:g} m")
         if self.tilt_deg is not None and not 0 <= self.tilt_deg[0] <= self.tilt_deg[1] <= _MOST_TILTED_DEG:
@@ -252,10 +261,12 @@ class CrossDomain:
 
     def poses(self, count: int) -> list[Rigid3]:
         """``map_from_camera`` of independent views: position, height above ground, heading and tilt by lot, such that
-        the photo lies inside and its middle 1.2 footprints from the border.
+        the photo lies inside and its middle 1.2 footprints from the border. Or of a lap.
 
         Raises: ValueError if the place is too small for them.
         """
+        if self.flown_as.spacing_m is not None:
+            return self._lap(self.flown_as.spacing_m, count)
         rng = np.random.default_rng([self.seed, 112])
         found: list[Rigid3] = []
         for _ in range(_ATTEMPTS + 50 * count):
@@ -313,6 +324,34 @@ class CrossDomain:
         ground_m = self._ground(xy)
         eye = np.array([xy[0] + self.place.west_m, xy[1] + self.place.south_m, ground_m + height_m])
         return Rigid3(map_from_camera, eye)
+
+    def _lap(self, spacing_m: float, count: int) -> list[Rigid3]:
+        """Along an ellipse in the middle of the place, banked as its curvature needs."""
+        axes = _LAP_PART * np.array([self.width_m, self.height_m])
+        turns = np.linspace(0.0, 2.0 * np.pi, 10_000)
+        around = axes * np.column_stack([np.cos(turns), np.sin(turns)])
+        flown_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(around, axis=0), axis=1))])
+        at = np.interp(spacing_m * np.arange(count) % flown_m[-1], flown_m, turns)
+        rng = np.random.default_rng([self.seed, 117])
+        ground_m = float(np.median(self.place.world.terrain))
+        poses = []
+        for turn in at:
+            xy = 0.5 * np.array([self.width_m, self.height_m]) + axes * (np.cos(turn), np.sin(turn))
+            ahead = axes * (-np.sin(turn), np.cos(turn))
+            radius_m = float(np.linalg.norm(ahead)) ** 3 / float(axes[0] * axes[1])
+            bank = -np.arctan2(LAP_SPEED_M_S**2, 9.81 * radius_m)  # to the left, the lap's inside
+            roll, pitch, yaw = np.radians(rng.normal(0.0, _LAP_JITTER_DEG, 3))
+            tilt = np.radians(0.0 if self.flown_as.tilt_deg is None else np.mean(self.flown_as.tilt_deg))
+            ned_from_body = rotation.from_euler(
+                float(bank + roll), float(tilt + pitch), float(np.arctan2(ahead[0], ahead[1]) + yaw)
+            )
+            pose = frames.map_from_ned_rotation(0.0) @ ned_from_body @ frames.BODY_FROM_NADIR_CAMERA
+            height_m = float(np.mean(self.flown_as.height_m))
+            eye = np.array([xy[0] + self.place.west_m, xy[1] + self.place.south_m, ground_m + height_m])
+            poses.append(Rigid3(pose, eye))
+        if not all(self._inside(pose) for pose in poses):
+            raise ValueError(f"{self.width_m:.0f} x {self.height_m:.0f} m have no room for a lap; take a larger place")
+        return poses
 
     def _ground(self, local: FloatArray) -> float:
         spec = self.place.world.spec
@@ -406,6 +445,9 @@ def write_set(out: Path, domain: CrossDomain, count: int, progress: bool = False
     scene = flown  # the survey's half gigabyte is done with
     renderer = domain.renderer(scene)
     start = datetime(2024, 1, 1) + timedelta(days=domain.flown.season.day - 1, hours=9)
+    spacing_m = domain.flown_as.spacing_m
+    # Minutes apart where every photo stands for itself.
+    step = timedelta(minutes=1) if spacing_m is None else timedelta(seconds=spacing_m / LAP_SPEED_M_S)
     with (out / f"{name}_flight.csv").open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow((*COLUMNS, "lasting_share"))
@@ -414,8 +456,7 @@ def write_set(out: Path, domain: CrossDomain, count: int, progress: bool = False
             quality = domain.exposure(k).jpeg_quality
             photo = domain.photo(renderer, pose, k)
             cv2.imwrite(str(out / filename), photo.image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
-            # Minutes apart: every photo stands for itself.
-            when = start + timedelta(minutes=k)
+            when = start + k * step
             row = flight_row(filename, when, pose, domain.camera, domain.georeference)
             table.writerow([*row, f"{photo.lasting_share:.4f}"])
 
@@ -481,13 +522,15 @@ def main(arguments: list[str] | None = None) -> int:
                         "degrees; far ground and sky may be in view (default: mostly little, at most 45)")  # fmt: skip
     parser.add_argument("--spectrum", type=Spectrum, choices=list(Spectrum), default=Spectrum.VISIBLE, help="of the "
                         "photos; the map's is visible light (default: %(default)s)")  # fmt: skip
+    parser.add_argument("--spacing", type=float, metavar="M", help="from photo to photo of a lap at 15 m/s (default: "
+                        "photos that have nothing to do with each other)")  # fmt: skip
     parser.add_argument("--photos", type=int, default=100, help="how many (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="of place, looks and poses (default: %(default)s)")
     parser.add_argument("--sheets", type=int, default=0, metavar="N", help="write PNGs of the first N photos beside "
                         "their map to OUT/sheets (default: %(default)s)")  # fmt: skip
     options = parser.parse_args(arguments)
     try:
-        flight = Flight(tuple(options.height), options.tilt and tuple(options.tilt), options.spectrum)
+        flight = Flight(tuple(options.height), options.tilt and tuple(options.tilt), options.spectrum, options.spacing)
     except ValueError as err:
         parser.error(str(err))
     domain = CrossDomain(options.kind, options.seed, flown_as=flight)

@@ -415,6 +415,26 @@ def test_too_small_a_place_is_refused() -> None:
         replace(SMALL, width_m=160.0, height_m=160.0).poses(3)
 
 
+def test_a_lap_goes_forward_by_its_spacing_and_looks_ahead() -> None:
+    domain = replace(SMALL, width_m=1200.0, height_m=1000.0, flown_as=Flight((80.0, 80.0), spacing_m=4.0))
+    poses = domain.poses(30)
+    steps = np.diff([pose.translation for pose in poses], axis=0)
+    assert np.linalg.norm(steps, axis=1) == pytest.approx(4.0, rel=1e-3)
+    for pose, step in zip(poses, steps, strict=False):
+        top = -pose.rotation[:2, 1] / np.linalg.norm(pose.rotation[:2, 1])
+        assert top @ step[:2] / 4.0 > np.cos(np.radians(6.0))
+        # The bank of a turn of some 300 m at 15 m/s is 4 degrees.
+        assert np.degrees(np.arccos(-pose.rotation[2, 2])) < 12.0
+    # The lap turns left, so the vehicle leans left: its right wing, the picture's right, is up.
+    assert np.mean([pose.rotation[2, 0] for pose in poses]) > 0.0
+    assert np.cross(steps[0], steps[-1])[2] > 0.0
+
+
+def test_a_lap_needs_room() -> None:
+    with pytest.raises(ValueError, match="no room for a lap"):
+        replace(SMALL, flown_as=Flight((400.0, 400.0), spacing_m=4.0)).poses(60)
+
+
 def test_oblique_flight_is_tilted_as_asked_and_shows_sky_and_the_place(flown: Scene) -> None:
     domain = replace(SMALL, flown_as=Flight((20.0, 40.0), (60.0, 70.0)))
     renderer, skies = domain.renderer(flown), []
