@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
-import rasterio.shutil
 from affine import Affine
 from replay import rendered
 
@@ -455,8 +454,9 @@ def sets(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     data = tmp_path_factory.mktemp("data")
     for name in ("good", "also"):
         shutil.copytree(flight, data / name)
-        for raster in ("dop", "dsm"):
-            rasterio.shutil.copy(PACK / f"{raster}.vrt", data / name / f"{name}_{raster}.tif", driver="GTiff")
+        rendered.write_map(
+            rendered.map_window(160.0, 0.25), data / name / f"{name}_dop.tif", data / name / f"{name}_dsm.tif"
+        )
     next((data / "also").glob("*_flight.csv")).write_text("nothing\n1\n", encoding="utf-8")
     (data / "good" / "samples").mkdir()
     (data / "good" / "samples" / "a.npz").write_bytes(b"no archive")
