@@ -60,6 +60,12 @@ def sites(data: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Site]:
     return [site for one in find_sets(data) for site in core.build_sites(one, scratch)]
 
 
+@pytest.fixture
+def built(sites: list[Site], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command takes the packs that are there. (That it builds them: `test_the_command_prints_...`.)"""
+    monkeypatch.setattr(core, "build_sites", lambda one, scratch: [site for site in sites if site.name == one.name])
+
+
 @pytest.fixture(scope="module")
 def scene(sites: list[Site]) -> Iterator[Scene]:
     with core.opened(sites[0], None) as found:
@@ -378,7 +384,7 @@ def test_the_command_prints_tables_targets_and_pictures(
 
 
 def test_a_false_fix_is_listed_with_its_number_and_can_be_run_alone(
-    data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    data: Path, built: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     believer = Estimator(np.zeros(6), 1.0, of_prior=True)
     monkeypatch.setattr(hostile, "localizers", lambda store, matcher, options: instead(believer))
@@ -395,7 +401,7 @@ def test_a_false_fix_is_listed_with_its_number_and_can_be_run_alone(
 
 
 def test_missed_frames_are_named_with_their_prior(
-    data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    data: Path, built: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     estimator = Estimator(np.array([2.0, 0, 0, 0, 0, 0]), 1.0, refused=("frame_01",))
     monkeypatch.setattr(core, "localizers", lambda store, matcher, options: instead(estimator))

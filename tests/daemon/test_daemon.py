@@ -440,6 +440,8 @@ pack = "{rendered.store().pack.path}"
 endpoint = "{endpoint}"
 [matcher]
 name = "sift"
+[timing]
+max_age_ms = 20000.0
 """
 
 

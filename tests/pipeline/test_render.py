@@ -73,7 +73,7 @@ class Place:
     dsm_up: float = -1.0
     dop_up: float = -1.0
     scale: float = 1.0
-    reach_m: float = 150.0
+    reach_m: float = 100.0
     origin: tuple[float, float] = (EAST + 11.0, NORTH - 7.0)
 
     @property
@@ -205,7 +205,7 @@ OFF_M = {0.0: (0.01, 0.01, 0.02), 30.0: (0.01, 0.02, 0.08), 50.0: (0.02, 0.12, 0
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 @pytest.mark.parametrize("tilt_deg", OFF_M)
 def test_points_lie_on_their_rays_and_on_the_surface(camera: Camera, tilt_deg: float) -> None:
-    place = Place(hills, scale=0.9996, reach_m=220.0)
+    place = Place(hills, scale=0.9996, reach_m=220.0, dop_m=1.0)
     window = place.window
     # Pixels of 0.22 m below.
     view = drawn(place, place.pose(0.22 * camera.focal_px, tilt_deg, roll_deg=7.0), camera, window)
@@ -266,7 +266,7 @@ def test_an_origin_in_the_distance_moves_nothing(origin: tuple[float, float]) ->
 @pytest.mark.parametrize("surface", [house, wall, hills], ids=["house", "wall", "hills"])
 def test_rays_end_at_the_first_thing_they_meet(surface: Surface, tilt_deg: float) -> None:
     """Away from edges, where a pixel's neighbours look at another thing."""
-    place = Place(surface, reach_m=200.0)
+    place = Place(surface, reach_m=200.0, dop_m=1.0)
     window = place.window
     # Looking north, so that the wall stands across.
     view = drawn(place, place.pose(50.0, tilt_deg, heading_deg=8.0), window=window)
@@ -391,7 +391,7 @@ def test_the_picture_stays_in_place_from_whichever_level_it_is_drawn(factor: flo
 
 def test_grazing_view_shows_the_map_in_place() -> None:
     """At 65 degrees, where the net's nodes are far apart on the ground."""
-    place = Place(level, reach_m=300.0)
+    place = Place(level, reach_m=120.0)
     view = drawn(place, place.pose(30.0, 65.0))
     # Waves of 6 m are too fine in the distance: only the near half.
     truth = painted_truth(place, view)

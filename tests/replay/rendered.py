@@ -16,6 +16,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import rasterio
+from affine import Affine
 from ortholoc_sim import demo_pack_path
 from ortholoc_sim.camera import Placement, Renderer
 from ortholoc_sim.epoch import FLIGHT
@@ -34,6 +36,7 @@ from ortholoc_edge.tiles.build import PackOptions, build_pack
 from ortholoc_edge.tiles.georeference import Georeference
 from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.store import MapStore
+from ortholoc_edge.tiles.window import MapWindow
 
 SHARED = Path(os.environ.get("ORTHOLOC_EDGE_SHARED", Path(__file__).resolve().parents[2].parent / "shared"))
 REAL = SHARED / "data" / "real"
@@ -175,6 +178,31 @@ def write_flight(folder: Path, poses: Sequence[Rigid3], camera: Camera = CAMERA,
         writer.writeheader()
         writer.writerows(rows)
     return folder
+
+
+def map_window(reach_m: float, gsd_m: float) -> MapWindow:
+    """The map within ``reach_m`` of the pack's middle."""
+    x, y = pose().translation[:2]
+    window = store().read((x - reach_m, y - reach_m, x + reach_m, y + reach_m), gsd_m)
+    assert window is not None
+    return window
+
+
+def write_map(window: MapWindow, dop: Path, dsm: Path, crs: str | None = "EPSG:32632") -> None:
+    """Plain GeoTIFFs of a window of this pack's, as packs are built from."""
+    grid = window.dop_grid
+    picture = store().read_colour(grid.bounds, grid.gsd_m)
+    assert picture is not None
+    assert picture.grid == grid
+    for path, bands, grid in (
+        (dop, np.moveaxis(picture.rgb, 2, 0), grid),
+        (dsm, window.dsm[None], window.dsm_grid),
+    ):
+        with rasterio.open(
+            path, "w", driver="GTiff", width=grid.width, height=grid.height, count=len(bands), dtype=bands.dtype.name,
+            crs=crs, transform=Affine(grid.dx, 0, grid.west, 0, grid.dy, grid.top),
+        ) as target:  # fmt: skip
+            target.write(bands)
 
 
 def write_picture(path: Path, image: ImageArray) -> Path:

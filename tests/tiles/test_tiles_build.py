@@ -1,5 +1,6 @@
 import json
 import resource
+import shutil
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -31,6 +32,17 @@ from ortholoc_edge.tiles.store import MapStore
 
 def built(dop, dsm, out, *, progress=None, **options):
     return build_pack(dop, dsm, out, PackOptions(**({"vertical": "unknown"} | options)), progress)
+
+
+@pytest.fixture(scope="module")
+def sound_pack(scene, tmp_path_factory):
+    """Of the default options; what tests change is a copy."""
+    return built(*scene, tmp_path_factory.mktemp("sound") / "pack")
+
+
+@pytest.fixture(scope="module")
+def sound_pack_of_50(scene, tmp_path_factory):
+    return built(*scene, tmp_path_factory.mktemp("sound") / "pack", quality=50)
 
 
 def test_pack_is_cogs_that_rasterio_opens(holed_pack):
@@ -135,8 +147,8 @@ def test_progress_rises_to_one(scene, tmp_path):
     assert all(message for _, message in steps)
 
 
-def test_auto_height_error_follows_the_gsd(scene, tmp_path):
-    assert built(*scene, tmp_path / "pack").manifest.dsm.max_z_error_m == 0.01
+def test_auto_height_error_follows_the_gsd(sound_pack):
+    assert sound_pack.manifest.dsm.max_z_error_m == 0.01
 
 
 @pytest.mark.parametrize(
@@ -154,9 +166,8 @@ def test_options_out_of_range(options):
         PackOptions(**options)
 
 
-def test_existing_pack_needs_force(scene, tmp_path):
-    out = tmp_path / "pack"
-    built(*scene, out)
+def test_existing_pack_needs_force(scene, sound_pack, tmp_path):
+    out = shutil.copytree(sound_pack.path, tmp_path / "pack")
     before = contents(out)
     with pytest.raises(MapError, match="--force"):
         built(*scene, out)
@@ -179,9 +190,8 @@ def test_force_spares_what_is_no_pack(scene, tmp_path):
 
 
 @pytest.mark.parametrize("at", [0.15, 0.3, 0.9, 0.98])
-def test_interrupted_build_leaves_the_old_pack_and_its_work(scene, tmp_path, at):
-    out, whole = tmp_path / "pack", tmp_path / "whole"
-    built(*scene, out)
+def test_interrupted_build_leaves_the_old_pack_and_its_work(scene, sound_pack, sound_pack_of_50, tmp_path, at):
+    out = shutil.copytree(sound_pack.path, tmp_path / "pack")
     before = contents(out)
 
     def interrupt(fraction, message):
@@ -195,15 +205,14 @@ def test_interrupted_build_leaves_the_old_pack_and_its_work(scene, tmp_path, at)
     # There is nothing to keep before the first tile.
     assert left == ([".pack.building"] if at > 0.2 else [])
     built(*scene, out, force=True, quality=50)
-    assert contents(out) == contents(built(*scene, whole, quality=50).path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["pack", "whole"]
+    assert contents(out) == contents(sound_pack_of_50.path)
+    assert [path.name for path in tmp_path.iterdir()] == ["pack"]
 
 
 @pytest.mark.parametrize(("limit_bytes", "kept"), [(1_000, []), (30_000, [".pack.building"])])
-def test_full_disk_is_a_map_error(scene, tmp_path, limit_bytes, kept):
+def test_full_disk_is_a_map_error(scene, sound_pack, tmp_path, limit_bytes, kept):
     """RLIMIT_FSIZE makes the kernel refuse real writes, as a full disk does: of the DOP's tile, of the DSM's."""
-    out = tmp_path / "pack"
-    old = built(*scene, out, quality=75)
+    out = shutil.copytree(sound_pack.path, tmp_path / "pack")
     before = contents(out)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, limits[1]))
@@ -213,7 +222,7 @@ def test_full_disk_is_a_map_error(scene, tmp_path, limit_bytes, kept):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert contents(out) == before
-    assert old.verify() == []
+    assert Pack.open(out).verify() == []
     assert [path.name for path in tmp_path.iterdir() if path != out] == kept
 
 
@@ -240,14 +249,12 @@ def test_pack_that_was_not_written_whole_is_not_installed(scene, tmp_path, monke
     assert not (tmp_path / "pack").exists()
 
 
-def test_pack_is_copied_where_it_cannot_be_linked(scene, tmp_path, monkeypatch):
-    linked = contents(built(*scene, tmp_path / "linked").path)
-
+def test_pack_is_copied_where_it_cannot_be_linked(scene, sound_pack, tmp_path, monkeypatch):
     def refused(source, target):
         raise OSError(1, "Operation not permitted")
 
     monkeypatch.setattr(build.os, "link", refused)
-    assert contents(built(*scene, tmp_path / "copied").path) == linked
+    assert contents(built(*scene, tmp_path / "copied").path) == contents(sound_pack.path)
 
 
 def test_finish_comes_before_the_name(scene, tmp_path):
