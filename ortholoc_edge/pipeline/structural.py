@@ -9,7 +9,7 @@ among turns, scales and shifts that the prior allows.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -70,6 +70,13 @@ LADDER = (
 )
 # Of a patch, below which its peak is chance.
 _MIN_SCORE = 0.2
+# Side of the map's pixels in a level's: up to the first the map is sharp enough. What a coarser map lacks is taken
+# from the frame by a blur (1-sigma, part of that side), and levels beyond the last are left out, but for so many: their
+# patches would be a dozen of the map's pixels wide and less.
+_AS_SHARP, _MAP_BLUR, _MAX_MAP_PX = 1.5, 0.6, 4.0
+_MIN_LEVELS = 2
+# Of the view that tells how far away the ground is.
+_THUMBNAIL_PX = 32
 # Standard deviation of the whole picture's shift, px of the level.
 _WHOLE_SIGMA_PX = 2.0
 # Scales of the robust loss in px: wide first, where the whole picture may still be turned by some degrees.
@@ -136,10 +143,27 @@ _EXACT = np.diag([1e-6] * 3 + [1e-10] * 3)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class QueryFields:
-    """A frame as the levels see it: pinhole cameras and fields (2, h, w) by level."""
+    """A frame as the levels see it: pinhole cameras, pictures (h, w) and fields (2, h, w) by level."""
 
     cameras: tuple[Camera, ...]
+    pictures: tuple[ImageArray, ...]
     fields: tuple[Float32Array, ...]
+
+    def as_sharp_as_a_map(self, map_px: Sequence[float]) -> QueryFields:
+        """Without what is finer than a map: edges that the frame alone can have would drown the others. Levels where
+        a patch is but a few pixels of the map go, fine ones that stay are blurred.
+
+        Args:
+            map_px: side of the map's pixels in each level's.
+        """
+        count = max(sum(side <= _MAX_MAP_PX for side in map_px), _MIN_LEVELS)
+        if count >= len(self.cameras) and max(map_px) <= _AS_SHARP:
+            return self
+        fields = [
+            orientation_field(_blurred(picture, side)) if side > _AS_SHARP else field
+            for picture, field, side in zip(self.pictures[:count], self.fields, map_px, strict=False)
+        ]
+        return QueryFields(self.cameras[:count], self.pictures[:count], tuple(fields))
 
 
 class QueryMaker:
@@ -171,13 +195,19 @@ class QueryMaker:
                 cv2.remap(image, *self._undistortion, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
                 dtype=np.uint8,
             )
-        fields = [orientation_field(image)]
+        pictures = [image]
         for camera in reversed(self._cameras[:-1]):
             image = np.asarray(
                 cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA), dtype=np.uint8
             )
-            fields.append(orientation_field(image))
-        return QueryFields(self._cameras, tuple(reversed(fields)))
+            pictures.append(image)
+        pictures.reverse()
+        return QueryFields(self._cameras, tuple(pictures), tuple(orientation_field(picture) for picture in pictures))
+
+
+def _blurred(image: ImageArray, map_px: float) -> ImageArray:
+    sigma_px = _MAP_BLUR * math.sqrt(map_px**2 - 1.0)
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px), dtype=np.uint8)
 
 
 def _size(camera: Camera, long_px: int) -> tuple[int, int]:
@@ -265,9 +295,11 @@ class Tracking:
         trace: Trace,
         tuning: Tuning = TUNING,
     ) -> None:
-        self._query, self._terrain, self._prior, self._camera = query, terrain, prior, camera
-        self._trace, self._tuning = trace, tuning
+        self._terrain, self._prior, self._camera, self._trace = terrain, prior, camera, trace
         predicted = terrain.local.local_from_map_pose(prior.map_from_camera)
+        with trace.stage("query_features"):
+            self._query = query.as_sharp_as_a_map(_map_px(terrain, query, predicted))
+        self._tuning = replace(tuning, levels=tuning.levels[: len(self._query.cameras)])
         covariance = prior.covariance + _EXACT
         self._predicted = PoseMeasurement(predicted, np.asarray(np.linalg.inv(covariance), dtype=np.float64))
         # The last word on the position has what was seen; the prediction only keeps the camera upright.
@@ -596,6 +628,15 @@ class Tracking:
         sigma = self._prior.height_sigma_m / height_m
         count = min(math.ceil(_SEARCH_SIGMAS * math.log1p(sigma) / math.log(_ZOOM) - 0.5), _MAX_ZOOMS // 2)
         return [height_m * (_ZOOM**k - 1.0) for k in range(-count, count + 1)]
+
+
+def _map_px(terrain: Terrain, query: QueryFields, pose: Rigid3) -> list[float]:
+    """Side of the map's pixels in each level's, in the middle of the view from a pose."""
+    view = render(terrain, query.cameras[0].resized(_THUMBNAIL_PX, _THUMBNAIL_PX), pose)
+    falling = max(-float(pose.rotation[2, 2]), 1.0 / MAX_RANGE_HEIGHTS)
+    distance_m = max(float(np.median(view.fall_m)) / falling, 1e-3)
+    side_m = terrain.pictures[0].grid.gsd_m / terrain.local.grid_scale
+    return [side_m * camera.focal_px / distance_m for camera in query.cameras]
 
 
 def _turns(sigma_rad: float) -> list[float]:

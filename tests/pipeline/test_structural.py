@@ -501,6 +501,32 @@ def test_its_own_view_is_tracked_to_centimetres(camera: Camera, tilt_deg: float)
     assert len(found.query_px) == len(found.points_local) == len(found.estimate.inliers)
 
 
+@pytest.mark.parametrize("height_m", [12.0, 20.0])
+def test_a_frame_much_finer_than_the_map_is_tracked(height_m: float) -> None:
+    """Pixels of the map are 0.4 m, the frame's 2 to 4 cm: sand between them that the map does not show."""
+    terrain, truth = painted(), camera_at(height_m=height_m)
+    camera = Camera.from_focal(640, 480, 540.0)
+    view = render(terrain, camera, truth)
+    sand = cv2.GaussianBlur(np.random.default_rng(1).normal(size=view.image.shape), (0, 0), 1.5)
+    grey = np.clip(view.image + 25.0 * sand / sand.std(), 0, 255).astype(np.uint8)
+    found = track(terrain, grey, predicted(terrain, truth, scale=height_m / 60.0), camera)
+    assert found is not None
+    assert found.support > 0.3
+    off_m, off_deg = rendered.errors(found.estimate.local_from_camera, truth)
+    assert off_m < 0.05 * height_m
+    assert off_deg < 2.0
+
+
+def test_a_map_as_fine_as_the_frame_leaves_it_as_it_is() -> None:
+    fields = QueryMaker(CAMERA).fields(render(painted(), CAMERA, camera_at()).image)
+    assert fields.as_sharp_as_a_map([0.3, 0.7, 1.4]) is fields
+    softened = fields.as_sharp_as_a_map([0.7, 1.4, 2.8])
+    assert softened.fields[1] is fields.fields[1]
+    assert not np.array_equal(softened.fields[2], fields.fields[2])
+    for coarse in ([1.2, 2.4, 4.8], [50.0, 100.0, 200.0]):
+        assert len(fields.as_sharp_as_a_map(coarse).fields) == 2
+
+
 def test_matches_are_in_pixels_of_the_full_frame() -> None:
     """Three times as large as the last level: half a pixel of that would be more than one."""
     camera = Camera.from_focal(1620, 1080, 1400.0)
