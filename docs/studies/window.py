@@ -123,8 +123,8 @@ class Line:
                 grey = np.ascontiguousarray(grey[:, ::-1])
             if self.dull:
                 grey = dulled(grey, self.dull, self.number, k)
-            assert self.localizer._tracking is not None
-            self._fields[k] = self.localizer._tracking.fields(grey)
+            assert self.localizer._tracking
+            self._fields[k] = self.localizer._tracking[0].fields(grey)
         return self._fields[k]
 
     def leg_variance(self, j: int, k: int) -> float:
@@ -239,9 +239,8 @@ def terrain_of(localizer: Localizer, priors: list[PosePrior]) -> tuple[LocalFram
     grounds = [localizer._predicted_ground(prior) for prior in priors]
     bounds = np.array([search_bounds(o, p, g, 2.5) for p, (g, o) in zip(priors, grounds, strict=True)])
     west, south, east, north = *bounds[:, :2].min(axis=0), *bounds[:, 2:].max(axis=0)
-    assert localizer._tracking is not None
     ground_m = grounds[-1][0]
-    gsd_m = localizer._distance_to_ground(priors[-1], ground_m) / localizer._tracking.finest.focal_px
+    gsd_m = localizer._distance_to_ground(priors[-1], ground_m) / localizer._tracking[0].finest.focal_px
     window = localizer._read((float(west), float(south), float(east), float(north)), gsd_m)
     local = localizer._local_frame(window, ground_m)
     terrain = Terrain.of(window, precondition.grey_map(window), local)
@@ -562,7 +561,7 @@ def convinces(contrasts: FloatArray, pose: Rigid3, covariance: FloatArray, prior
         return False
     return (
         gate.certain(covariance, height_m, limits)
-        or gate.agrees_with(prior, pose, covariance, gate.for_support(0.0, limits))
+        or gate.agrees_with(prior, pose, covariance, gate.for_structure(0.0, limits))
     ) is None
 
 

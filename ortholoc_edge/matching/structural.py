@@ -18,6 +18,9 @@ from ortholoc_edge.geometry.arrays import Float32Array, FloatArray
 
 _MIN_ENERGY: Final = 1e-9
 _DOUBT: Final = 0.01
+# Of `Correlation.contrast`: how far from a shift is beside it.
+_BESIDE_PX: Final = 2
+_MIN_FOR_CONTRAST: Final = 20
 # Pixels that are multiplied at a time.
 _BAND_PX: Final = 49152
 # Shifts by one pixel, counted from (-1, -1), at which a patch is compared with itself: none, right, below, and along
@@ -103,6 +106,30 @@ class Correlation:
         turned = np.einsum("nij,nj->ni", bend, off)
         score = centre + np.einsum("ni,ni->n", off, slope + 0.5 * turned)
         return np.where(inside, score, 0.0), np.where(inside[:, None], slope + turned, 0.0), inside
+
+
+    def contrast(self, shift_px: FloatArray, kept: np.ndarray, shared: float) -> float:
+        """How much better patches fit at one shift (N, 2) of each than two pixels and more beside it, in standard
+        deviations of the mean: 0 on average where the shifts have nothing to do with the pictures.
+
+        Patches without a peak of their own still know. Their own best shifts tell less: rows and roads give dozens of
+        patches a peak that agrees with a wrong pose.
+
+        Args:
+            kept: (N,) which patches count.
+            shared: how many of them see the same pixel.
+        Returns: 0 for fewer than 20.
+        """
+        score, _, inside = self.at(shift_px)
+        chosen = np.flatnonzero(inside & kept)
+        if len(chosen) < _MIN_FOR_CONTRAST:
+            return 0.0
+        column, row = np.round(shift_px[chosen] - self.origin + self.radius).astype(np.intp).T
+        tried = np.arange(2 * self.radius + 1)[:, None]
+        beside = (np.abs(tried - row) >= _BESIDE_PX)[:, None] | (np.abs(tried - column) >= _BESIDE_PX)[None]
+        around = np.einsum("yxn,yxn->n", self.scores[:, :, chosen], beside) / beside.sum(axis=(0, 1))
+        rise = score[chosen] - around
+        return float(rise.mean() / (max(float(rise.std()), 1e-6) / np.sqrt(len(rise) / shared)))
 
 
 def correlate(

@@ -260,7 +260,7 @@ class Localizer:
         if found is None:
             raise RejectedError(Reason.FEW_MATCHES, "the map in the predicted view looks nothing like the frame")
         with trace.stage("gate"):
-            refusal = gate.well_supported(found.support, self._options.gate) or gate.without_rival(
+            refusal = gate.with_contrast(found.contrast, self._options.gate) or gate.without_rival(
                 found.rival, self._options.gate
             )
             if refusal is not None:
@@ -268,7 +268,7 @@ class Localizer:
             solved = Solved(
                 found.query_px, local.map_from_local(found.points_local), found.estimate, len(found.query_px)
             )
-            limits = gate.for_support(found.support, self._options.gate)
+            limits = gate.for_structure(found.support, self._options.gate)
             fix = self._fix(frame, solved, Scene(window, local, ground_m), prior, limits)
         return replace(fix, quality=found.support, timings_ms=trace.timings_ms())
 

@@ -23,6 +23,7 @@ class Reason(StrEnum):
     FEW_MATCHES = "few_matches"
     FEW_INLIERS = "few_inliers"
     LOW_INLIER_RATIO = "low_inlier_ratio"
+    LOW_CONTRAST = "low_contrast"  # the map fits hardly better where the pose puts it than beside it
     POOR_SPREAD = "poor_spread"  # inliers huddle in a part of the image
     HIGH_REPROJECTION = "high_reprojection"
     DEGENERATE_GEOMETRY = "degenerate_geometry"  # the pose is not determined by the matches

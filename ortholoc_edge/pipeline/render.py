@@ -250,6 +250,4 @@ def _upsampled(nodes: Float32Array, camera: Camera) -> Float32Array:
     """Values (H, W) at the pixels, of values at the nodes."""
     size = nodes.shape[1] * _NODE_PX, nodes.shape[0] * _NODE_PX
     full = cv2.resize(nodes, size, interpolation=cv2.INTER_LINEAR)
-    return np.ascontiguousarray(
-        full[_NODE_PX : _NODE_PX + camera.height, _NODE_PX : _NODE_PX + camera.width], dtype=np.float32
-    )
+    return np.asarray(full[_NODE_PX : _NODE_PX + camera.height, _NODE_PX : _NODE_PX + camera.width], dtype=np.float32)

@@ -74,9 +74,8 @@ _MIN_SCORE = 0.2
 # from the frame by a blur (1-sigma, part of that side), and levels beyond the last are left out, but for so many: their
 # patches would be a dozen of the map's pixels wide and less.
 _AS_SHARP, _MAP_BLUR, _MAX_MAP_PX = 1.5, 0.6, 4.0
+_COARSEST_PX = 16.0
 _MIN_LEVELS = 2
-# Of the view that tells how far away the ground is.
-_THUMBNAIL_PX = 32
 # Standard deviation of the whole picture's shift, px of the level.
 _WHOLE_SIGMA_PX = 2.0
 # Scales of the robust loss in px: wide first, where the whole picture may still be turned by some degrees.
@@ -206,7 +205,8 @@ class QueryMaker:
 
 
 def _blurred(image: ImageArray, map_px: float) -> ImageArray:
-    sigma_px = _MAP_BLUR * math.sqrt(map_px**2 - 1.0)
+    # Under a camera that is thought to stand on the ground the map's pixels have no end.
+    sigma_px = _MAP_BLUR * math.sqrt(min(map_px, _COARSEST_PX) ** 2 - 1.0)
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px), dtype=np.uint8)
 
 
@@ -218,7 +218,8 @@ def _size(camera: Camera, long_px: int) -> tuple[int, int]:
 @dataclass(frozen=True, slots=True, eq=False)
 class _Step:
     """One level's outcome: the view that was drawn and its field; matches (N) of level px and local points, how well
-    they fit, how sure their places are, and which agree with the pose; and how many patches were in view."""
+    they fit, how sure their places are, and which agree with the pose; how many patches were in view; and of the last
+    level their contrast."""
 
     view: RenderedView
     template: Float32Array
@@ -229,6 +230,7 @@ class _Step:
     information: FloatArray
     inliers: BoolArray
     looked_for: int
+    contrast: float = 0.0
 
     @property
     def pose(self) -> Rigid3:
@@ -258,6 +260,7 @@ class Track:
         estimate: at the frame's full size.
         query_px: (M, 2) px of the frame without distortion; points_local: (M, 3).
         support: part of the patches in view that agree with the pose.
+        contrast: how much better all patches in view fit there than beside it: `structural.Correlation.contrast`.
         plausible: whether other ways need not be tried around the same prior.
         convincing: whether they need not be tried anywhere.
         second: the second level's outcome.
@@ -268,6 +271,7 @@ class Track:
     query_px: FloatArray
     points_local: FloatArray
     support: float
+    contrast: float
     plausible: bool
     convincing: bool
     second: _Step
@@ -430,9 +434,11 @@ class Tracking:
             )
         with self._trace.stage("pose"):
             step = self._adjusted(number, view, found, template, known, pose, whole)
-            if step is None or not self._tuning.polish or number < len(self._tuning.levels) - 1:
+            if step is None or number < len(self._tuning.levels) - 1:
                 return step
-            return self._polished(view, found, known, step)
+            if self._tuning.polish:
+                step = self._polished(view, found, known, step)
+            return replace(step, contrast=_contrast(view, found, step.pose, level))
 
     def _polished(
         self, view: RenderedView, found: structural.Correlation, known: PoseMeasurement, step: _Step
@@ -578,7 +584,8 @@ class Tracking:
         convincing = (
             enough and support >= _CONVINCING_SUPPORT and all(step.agreeing >= _CONVINCING_BEFORE for step in steps)
         )
-        return Track(estimate, resize_px(last.px, scale), last.points, support, plausible, convincing, steps[1])
+        query_px = resize_px(last.px, scale)
+        return Track(estimate, query_px, last.points, support, last.contrast, plausible, convincing, steps[1])
 
     def _covariance(self, step: _Step, camera: Camera) -> FloatArray | None:
         """(6, 6): of what was seen, together with the attitude that was known; None if that determines no pose."""
@@ -632,9 +639,8 @@ class Tracking:
 
 def _map_px(terrain: Terrain, query: QueryFields, pose: Rigid3) -> list[float]:
     """Side of the map's pixels in each level's, in the middle of the view from a pose."""
-    view = render(terrain, query.cameras[0].resized(_THUMBNAIL_PX, _THUMBNAIL_PX), pose)
     falling = max(-float(pose.rotation[2, 2]), 1.0 / MAX_RANGE_HEIGHTS)
-    distance_m = max(float(np.median(view.fall_m)) / falling, 1e-3)
+    distance_m = max((float(pose.translation[2]) - terrain.typical_m) / falling, 1e-3)
     side_m = terrain.pictures[0].grid.gsd_m / terrain.local.grid_scale
     return [side_m * camera.focal_px / distance_m for camera in query.cameras]
 
@@ -644,6 +650,14 @@ def _turns(sigma_rad: float) -> list[float]:
     step = min(max(_TURN_SIGMAS * sigma_rad, _MIN_TURN_RAD), _MAX_TURN_RAD)
     count = min(math.ceil(_SEARCH_SIGMAS * sigma_rad / step - 0.5), _MAX_TURNS // 2)
     return [step * k for k in range(-count, count + 1)]
+
+
+def _contrast(view: RenderedView, found: structural.Correlation, pose: Rigid3, level: Level) -> float:
+    """Of all patches that show map, at a pose."""
+    points = view.points_local(found.template_px)
+    shift, _ = linearised(points, found.template_px, view.camera, pose)
+    shift = np.where(np.isfinite(shift), shift, np.inf)
+    return found.contrast(shift, _shown(view, found.template_px), (level.patch_cells / level.stride) ** 2)
 
 
 def _absorbed_error_factor(scores: FloatArray) -> float:

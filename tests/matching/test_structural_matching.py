@@ -366,3 +366,36 @@ def test_whole_shift_of_nothing() -> None:
         assert len(peaks) == 2
         assert np.isfinite(peaks).all()
         assert np.abs(np.array(peaks)[:, :2]).max() <= 20
+
+
+# -- contrast ----------------------------------------------------------------
+
+
+def contrast_of(template: Float32Array, searched: Float32Array, shift: tuple[float, float]) -> float:
+    made = correlate(template, searched, radius=2, cell=16, patch_cells=3)
+    count = len(made.template_px)
+    return made.contrast(np.tile(shift, (count, 1)), np.ones(count, bool), 9.0)
+
+
+def test_contrast_tells_the_right_shift_from_others_and_from_other_pictures() -> None:
+    """Under noise that leaves few patches a peak of their own."""
+    rng = np.random.default_rng(0)
+    scene = field(0)
+    noisy = np.roll(scene, (1, -1), axis=(1, 2)) + 1.5 * rng.standard_normal(scene.shape).astype(np.float32)
+    right = contrast_of(scene, noisy, (-1.0, 1.0))
+    assert right > 8.0
+    assert contrast_of(scene, noisy, (1.0, -1.0)) < 0.5 * right
+    assert contrast_of(scene, -noisy, (-1.0, 1.0)) < -8.0
+    others = [contrast_of(field(0), field(seed), (0.0, 0.0)) for seed in range(1, 30)]
+    assert abs(float(np.mean(others))) < 1.0
+    assert max(others) < 4.5
+
+
+def test_contrast_needs_patches_and_shifts_that_were_tried() -> None:
+    made = correlate(field(0), field(0), radius=2, cell=16, patch_cells=3)
+    count = len(made.template_px)
+    still = np.zeros((count, 2))
+    few = np.arange(count) < 19
+    assert made.contrast(still, few, 9.0) == 0.0
+    assert made.contrast(np.full((count, 2), np.inf), np.ones(count, bool), 9.0) == 0.0
+    assert made.contrast(np.full((count, 2), 2.4), np.ones(count, bool), 9.0) == 0.0

@@ -198,3 +198,14 @@ def test_only_inliers_count_for_the_spread():
     assert gate.check(**case(query_px=px)).reason is Reason.POOR_SPREAD
     everyone = replace(estimate(), inliers=np.ones(100, bool))
     assert gate.check(**case(query_px=px, estimate=everyone)) is None
+
+
+def test_contrast_and_support_stand_for_counts():
+    options = gate.GateOptions()
+    assert gate.with_contrast(options.min_contrast, options) is None
+    refused = gate.with_contrast(options.min_contrast - 0.1, options)
+    assert refused is not None
+    assert refused.reason is Reason.LOW_CONTRAST
+    sure, unsure = (gate.for_structure(support, options) for support in (0.15, 0.149))
+    assert sure.min_inlier_ratio == unsure.min_inlier_ratio == 0.0
+    assert (sure.max_innovation_sigmas, unsure.max_innovation_sigmas) == (5.0, 3.0)

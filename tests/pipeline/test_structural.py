@@ -280,7 +280,7 @@ def test_what_does_not_show_the_map_is_refused(picture: str) -> None:
     image = NOT_THE_MAP[picture](rendered.picture(TURNED))
     refused = assert_rejected(
         localize(Frame(9, image, picture), rendered.prior(TURNED)),
-        Reason.FEW_MATCHES, Reason.FEW_INLIERS, Reason.LOW_INLIER_RATIO, Reason.DEGENERATE_GEOMETRY,
+        Reason.FEW_MATCHES, Reason.FEW_INLIERS, Reason.LOW_CONTRAST, Reason.DEGENERATE_GEOMETRY,
     )  # fmt: skip
     assert refused.stamp_ns == 9
     assert refused.detail
@@ -303,7 +303,7 @@ def test_a_region_is_no_prediction() -> None:
         (rendered.prior(FAR), {}, Reason.OUTSIDE_MAP),
         (rendered.prior(NADIR, (0, 0, -150.0)), {}, Reason.PRIOR_DISAGREES),
         (rendered.prior(NADIR, sigma_m=(16.0, 60.0)), {"max_window_mpx": 0.001}, Reason.PRIOR_TOO_WIDE),
-        (rendered.prior(NADIR), {"gate": GateOptions(min_inliers=5000)}, Reason.FEW_INLIERS),
+        (rendered.prior(NADIR), {"gate": GateOptions(min_contrast=500.0)}, Reason.LOW_CONTRAST),
         (rendered.prior(NADIR), {"gate": GateOptions(max_relative_sigma=1e-5)}, Reason.UNCERTAIN),
         (rendered.prior(NADIR), {"gate": GateOptions(min_spread=1.0)}, Reason.POOR_SPREAD),
     ],

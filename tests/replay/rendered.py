@@ -194,13 +194,13 @@ def write_map(window: MapWindow, dop: Path, dsm: Path, crs: str | None = "EPSG:3
     picture = store().read_colour(grid.bounds, grid.gsd_m)
     assert picture is not None
     assert picture.grid == grid
-    for path, bands, grid in (
+    for path, bands, own in (
         (dop, np.moveaxis(picture.rgb, 2, 0), grid),
         (dsm, window.dsm[None], window.dsm_grid),
     ):
         with rasterio.open(
-            path, "w", driver="GTiff", width=grid.width, height=grid.height, count=len(bands), dtype=bands.dtype.name,
-            crs=crs, transform=Affine(grid.dx, 0, grid.west, 0, grid.dy, grid.top),
+            path, "w", driver="GTiff", width=own.width, height=own.height, count=len(bands), dtype=bands.dtype.name,
+            crs=crs, transform=Affine(own.dx, 0, own.west, 0, own.dy, own.top),
         ) as target:  # fmt: skip
             target.write(bands)
 
