@@ -644,22 +644,21 @@ class Chain:
 def _localized(line: Line, k: int, prior: PosePrior) -> object:
     """Of the localizer as it flies; the picture's fields are those of the line."""
     localizer = line.localizer
-    maker = localizer._tracking
-    assert maker is not None
+    makers = localizer._tracking
     ready = line.fields(k)
 
     class Ready:
-        finest = maker.finest
+        finest, tuning = makers[0].finest, makers[0].tuning
 
         def fields(self, grey: ImageArray) -> structural.QueryFields:
             return ready
 
-    localizer._tracking = Ready()  # type: ignore[assignment]
+    localizer._tracking = [Ready()]  # type: ignore[list-item]
     try:
         empty = np.zeros((localizer.camera.height, localizer.camera.width), np.uint8)
         return localizer.localize(Frame(0, empty, str(k)), prior)
     finally:
-        localizer._tracking = maker
+        localizer._tracking = makers
 
 
 VARIANTS = {
