@@ -79,7 +79,8 @@ class MapOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Which area pack, and how much memory it may take.
 
     ``memory_mb``: limit of its compressed files, which all are held; a larger pack is refused at the start.
-    ``cache_mb``: limit of decoded blocks, in grey and heights, besides; one view and its next take 4 to 6.
+    ``cache_mb``: limit of decoded blocks, in grey and heights, besides; a view of structural matching takes 4 to 6,
+    one of features up to 14.
     ``require_intact``: refuse a pack with missing or damaged files instead of flying with holes in the map.
     ``public_key``: PEM file; refuse a pack that this key did not sign. None: a signature is not looked for.
     """

@@ -184,7 +184,8 @@ class Daemon:
         return self._link
 
     def statistics(self) -> dict[str, Statistic]:
-        """Counters since the start: ours, the recorder's and the bus's drops, and the link's under ``link.``"""
+        """Counters since the start: ours, the recorder's and the bus's drops, and the link's under ``link.``; and the
+        rung of detail that frames are localized at."""
         return {
             **self._counts,
             "frames_replaced": self._slot.replaced,

@@ -118,11 +118,11 @@ class Correlation:
         Args:
             kept: (N,) which patches count.
             shared: how many of them see the same pixel.
-        Returns: 0 for fewer than 20.
+        Returns: 0 for fewer than 20, or where nothing beside was tried (a radius of 1).
         """
         score, _, inside = self.at(shift_px)
         chosen = np.flatnonzero(inside & kept)
-        if len(chosen) < _MIN_FOR_CONTRAST:
+        if len(chosen) < _MIN_FOR_CONTRAST or self.radius < _BESIDE_PX:
             return 0.0
         column, row = np.round(shift_px[chosen] - self.origin + self.radius).astype(np.intp).T
         tried = np.arange(2 * self.radius + 1)[:, None]

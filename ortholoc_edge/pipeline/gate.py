@@ -106,14 +106,14 @@ def enough_inliers(estimate: PoseEstimate, options: GateOptions) -> Refusal | No
 
 def with_contrast(contrast: float, options: GateOptions) -> Refusal | None:
     """At a wrong pose all patches together fit no better than beside it, even where some agree by chance."""
-    if contrast < options.min_contrast:
+    if not contrast >= options.min_contrast:
         return Refusal(Reason.LOW_CONTRAST, "fit of the view over that beside it", contrast, options.min_contrast)
     return None
 
 
 def without_rival(rival: float, options: GateOptions) -> Refusal | None:
     """Where a pattern repeats a pose one period further fits as well; nothing in the picture tells which is right."""
-    if rival > options.max_rival:
+    if not rival <= options.max_rival:
         return Refusal(Reason.AMBIGUOUS, "inliers of a pose elsewhere, part of this one's", rival, options.max_rival)
     return None
 

@@ -8,10 +8,10 @@ from statistics import median
 
 logger = logging.getLogger(__name__)
 
-# Frames whose median decides for a step down, and that must all leave room for a step up. Slow to rise: a processor
-# that was throttled for heat heats up again.
-_FRAMES_DOWN, _FRAMES_UP = 5, 50
-# Of the budget, what the frames on a rung may take at most before the next one up is tried, which takes up to 1.6 times
+# Frames whose median decides for a step down, and of which all but some must leave room for a step up: a search now
+# and then must not keep detail out. Slow to rise: a processor that was throttled for heat heats up again.
+_FRAMES_DOWN, _FRAMES_UP, _WITHOUT_ROOM = 5, 50, 5
+# Of the budget, what these frames may take at most before the next one up is tried, which takes up to 1.6 times
 # as long (docs/studies/structural.md).
 _ROOM = 0.55
 
@@ -44,8 +44,10 @@ class Ladder:
             if middle_ms > self._budget_ms:
                 self._step(1, f"frames take {middle_ms:.0f} ms, {self._budget_ms:.0f} are allowed")
                 return
-        if self._rung > 0 and len(recent) == _FRAMES_UP and max(recent) < _ROOM * self._budget_ms:
-            self._step(-1, f"the last {_FRAMES_UP} frames took {max(recent):.0f} ms at most")
+        if self._rung > 0 and len(recent) == _FRAMES_UP:
+            most_ms = sorted(recent)[-1 - _WITHOUT_ROOM]
+            if most_ms < _ROOM * self._budget_ms:
+                self._step(-1, f"nine of ten frames took {most_ms:.0f} ms at most")
 
     def _step(self, change: int, why: str) -> None:
         self._rung += change

@@ -217,7 +217,9 @@ class Localizer:
                 refused = RejectedError(Reason.NO_PRIOR, "structural matching needs a predicted pose")
             else:
                 try:
-                    return self._by_structure(self._tracking[rung], frame, grey, prior, proceed, trace)
+                    with trace.stage("structural"):
+                        fix = self._by_structure(self._tracking[rung], frame, grey, prior, proceed, trace)
+                    return replace(fix, timings_ms=trace.timings_ms())
                 except RejectedError as error:
                     refused = error
             if self._acquire is None or not proceed():
@@ -270,7 +272,7 @@ class Localizer:
             )
             limits = gate.for_structure(found.support, self._options.gate)
             fix = self._fix(frame, solved, Scene(window, local, ground_m), prior, limits)
-        return replace(fix, quality=found.support, timings_ms=trace.timings_ms())
+        return replace(fix, quality=found.support)
 
     def _track(
         self,

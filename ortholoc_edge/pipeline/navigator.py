@@ -57,6 +57,8 @@ class Navigator:
         else:
             self.prior = predicted
             outcome = self.localizer.localize(frame, predicted, proceed, self.ladder.rung)
-            self.ladder.note(outcome.timings_ms["total"])
+            # Only what a rung can change; and a frame that was refused before anything was matched took no time.
+            if "match" in outcome.timings_ms and "structural" in outcome.timings_ms:
+                self.ladder.note(outcome.timings_ms["structural"])
         self.tracker.update(outcome, state)
         return outcome

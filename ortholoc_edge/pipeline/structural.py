@@ -90,9 +90,9 @@ _LAST_INLIER_PX = 0.8
 # Shift of the whole view that is looked for, in sigmas of the prior, and its limits as parts of the long side.
 _REACH_SIGMAS = 3.5
 _MIN_REACH, _MAX_REACH = 0.08, 0.45
-# Matches that agree at the last level, and their part of the patches in view: from the lower part on a search around
-# the same prior finds nothing better (676 frames, docs/studies/structural.md, "Support"); from the higher, if so many
-# of the matches agreed at each level, other priors need not be tried either.
+# Matches that agree at the last level (with a patch at every cell), and their part of the patches in view: from the
+# lower part on a search around the same prior finds nothing better (676 frames, docs/studies/structural.md, "Support");
+# from the higher, if so many of the matches agreed at each level, other priors need not be tried either.
 _CONVINCING_MATCHES = 60
 _PLAUSIBLE_SUPPORT, _CONVINCING_SUPPORT = 0.15, 0.35
 _CONVINCING_BEFORE = 0.5
@@ -120,11 +120,11 @@ _RIVAL_PEAKS = 5
 _RIVAL_PEAK = 0.6
 _RIVAL_LESS_PROBABLE = 16.0
 _OWN_PEAK_PX = 4.0
-# Part of the second level's matches that agree with the track, below which a rival is not followed further.
-_RIVAL_AGREE = 0.4
-# Of the last level's patches: independent samples (48 x 48 px, correlated over 3, shared with neighbours), and the
-# highest correlation that counts.
-_SAMPLES = 80.0
+# Part of the track's support at the second level, below which a rival is not followed to the last.
+_RIVAL_SUPPORT = 0.4
+# Independent samples of a patch of 48 x 48 px (correlated over 3, shared with neighbours), and the highest correlation
+# that counts.
+_SAMPLES, _SAMPLED_PX = 80.0, 48.0
 _MAX_SCORE = 0.98
 _POLISHES = 4
 # In standard deviations: what moves the pose by less changes nothing.
@@ -313,7 +313,8 @@ class Tracking:
         self._upright = PoseMeasurement(predicted, upright)
 
     def run(self, proceed: Callable[[], bool] = lambda: True) -> Track | None:
-        """The first track that convinces, else the one with the most inliers; None if there is none.
+        """The track from the prediction if it is plausible, else that with the most inliers of it and the best start of
+        a search; None if there is none.
 
         Args:
             proceed: asked before the search and each of its starts; False ends it.
@@ -327,11 +328,12 @@ class Tracking:
         return replace(best, rival=other.inliers / best.inliers)
 
     def _best(self, proceed: Callable[[], bool]) -> Track | None:
-        best = self._descend(self._predicted.local_from_camera, look_wide=True)
+        approach = self._approach(self._predicted.local_from_camera, [], look_wide=True)
+        best = None if approach is None else self._arrive(approach)
         if best is not None and best.plausible:
             return best
         # The last level costs as much as all before it: only the best of the starts gets there.
-        approach: list[_Step] | None = None
+        approach = None
         seen: list[Rigid3] = []
         for start in self._search() if proceed() else []:
             if not proceed():
@@ -358,7 +360,7 @@ class Tracking:
             if math.hypot(x, y) <= _OWN_PEAK_PX or peak < _RIVAL_PEAK * own or self._improbability(start) > limit:
                 continue
             approach = self._approach(start, seen)
-            if approach is None or approach[-1].agree < _RIVAL_AGREE * second.agree:
+            if approach is None or approach[-1].support < _RIVAL_SUPPORT * second.support:
                 continue
             rival = self._arrive(approach)
             if rival is None or self._alike(rival.estimate.local_from_camera, found_pose):
@@ -371,16 +373,12 @@ class Tracking:
         error = self._predicted.error(pose)
         return float(error @ self._predicted.information @ error)
 
-    def _descend(self, pose: Rigid3, look_wide: bool) -> Track | None:
-        """Through the levels. ``look_wide``: at the first the shift of the whole view is looked for before."""
-        approach = self._approach(pose, [], look_wide)
-        return None if approach is None else self._arrive(approach)
-
     def _approach(self, pose: Rigid3, seen: list[Rigid3], look_wide: bool = False) -> list[_Step] | None:
         """Through all levels but the last; None where that leads nowhere, or where the first leads to a place seen.
 
         Args:
             seen: where the first level led others; its place is added.
+            look_wide: whether the shift of the whole view is looked for before.
         """
         step = self._level(0, pose, self._predicted, look_wide)
         if step is None or any(self._alike(step.pose, other) for other in seen):
@@ -437,16 +435,20 @@ class Tracking:
             if step is None or number < len(self._tuning.levels) - 1:
                 return step
             if self._tuning.polish:
-                step = self._polished(view, found, known, step)
+                samples = _SAMPLES * (level.patch_cells * level.cell_px / _SAMPLED_PX) ** 2
+                step = self._polished(view, found, known, step, samples)
             return replace(step, contrast=_contrast(view, found, step.pose, level))
 
     def _polished(
-        self, view: RenderedView, found: structural.Correlation, known: PoseMeasurement, step: _Step
+        self, view: RenderedView, found: structural.Correlation, known: PoseMeasurement, step: _Step, samples: float
     ) -> _Step:
         """The pose at which all patches together fit best, and not only those with a peak of their own.
 
         The likelihood of a patch of n independent samples at correlation r is ``(1 - r^2)^(-n/2)``; its slope and its
         expected curvature, of the patch's own sharpness, give Newton's step for the pose.
+
+        Args:
+            samples: independent ones of a patch.
         """
         pose = step.adjusted.local_from_camera
         points, shown = view.points_local(found.template_px), _shown(view, found.template_px)
@@ -454,7 +456,7 @@ class Tracking:
             shift, jacobian = linearised(points, found.template_px, view.camera, pose)
             score, slope, inside = found.at(np.where(np.isfinite(shift), shift, np.inf))
             score = np.where(inside & shown, np.clip(score, 0.0, _MAX_SCORE), 0.0)
-            strength = _SAMPLES * score / (1.0 - score**2)
+            strength = samples * score / (1.0 - score**2)
             stiffness = (strength * score)[:, None, None] * found.sharpness
             normal, _ = normal_equations(jacobian, stiffness, np.zeros_like(shift))
             rise = (strength[:, None] * slope).ravel() @ jacobian.reshape(-1, 6)
@@ -579,7 +581,7 @@ class Tracking:
             float(np.sqrt(np.mean(errors[last.inliers] ** 2))),
         )
         support = last.support
-        enough = last.agree >= _CONVINCING_MATCHES
+        enough = last.agree >= _CONVINCING_MATCHES / self._tuning.levels[-1].stride ** 2
         plausible = enough and support >= _PLAUSIBLE_SUPPORT
         convincing = (
             enough and support >= _CONVINCING_SUPPORT and all(step.agreeing >= _CONVINCING_BEFORE for step in steps)

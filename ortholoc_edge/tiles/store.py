@@ -27,15 +27,15 @@ from ortholoc_edge.tiles.window import ColourWindow, MapWindow, SurfaceWindow
 
 logger = logging.getLogger(__name__)
 
-# A view of 768 x 576 px and its heights are 4 to 6 MiB of blocks, stored or averaged: with less it pushes itself out,
-# and with more a flight decodes no less (measured).
+# What structural matching reads for a view, with its heights, is 4 to 6 MiB of blocks, stored or averaged: with less it
+# pushes itself out, and with more a flight decodes no less (measured). Features matched at 640 px take up to 14.
 CACHE_BYTES = 8 * 2**20
 # GDAL's own cache, of the whole process: a block is read from it once and as a whole, so one is enough.
 _GDAL_CACHE_BYTES = 2**20
 # Of compressed files: about 190 km2 at 4 MB per km2.
 MEMORY_BYTES = 768 * 2**20
 
-# 16 Mpx of RGB and mask are 64 MB; a localizer works on 0.3-1 Mpx.
+# 16 Mpx in colour with a mask are 64 MB; a localizer works on 0.3-1 Mpx in grey.
 MAX_PIXELS = 16_000_000
 
 # A level may be a little coarser than asked for: overview pixels can be a trifle larger than 2^k of the full ones.
@@ -93,7 +93,8 @@ class MapStore:
             )
         set_block_cache(_GDAL_CACHE_BYTES)
         self._cache = BlockCache(cache_bytes)
-        shared = pack.path, Handles(), self._cache, pack.missing
+        self._handles = Handles()
+        shared = pack.path, self._handles, self._cache, pack.missing
         self._dop = LoadedLayer(manifest.dop, *shared, salvage=not pack.signed)
         try:
             self._dsm = LoadedLayer(manifest.dsm, *shared, salvage=not pack.signed)
@@ -251,7 +252,8 @@ class MapStore:
 
     def forget_decoded(self) -> None:
         """Empty the cache of decoded blocks, to time reads without."""
-        self._cache.clear()
+        with self._handles.lock:
+            self._cache.clear()
 
     def _dop_window(self, bounds: Bounds, gsd_m: float) -> tuple[int, PixelWindow, RasterGrid] | None:
         """Level, pixels and grid of a region of the DOP; None where it has no pixel."""

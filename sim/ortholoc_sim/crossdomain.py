@@ -119,7 +119,7 @@ class Flight:
     spacing_m: float | None = None
 
     def __post_init__(self) -> None:
-        if self.spacing_m is not None and not self.spacing_m > 0:
+        if self.spacing_m is not None and not 0 < self.spacing_m < np.inf:
             raise ValueError(f"{self.spacing_m:g} m from photo to photo")
         if not 0 < self.height_m[0] <= self.height_m[1]:
             raise ValueError(f"height above ground from {self.height_m[0]:g} to {self.height_m[1]:g} m")

@@ -32,10 +32,11 @@ def test_room_steps_up_only_after_fifty_frames_on_end():
     assert climbed(ladder, [40.0] * 60) == [1] * 49 + [0] * 11
 
 
-def test_a_frame_without_room_keeps_the_rung():
-    ladder = Ladder(2, 100.0)
-    climbed(ladder, [150.0] * 5)
-    assert climbed(ladder, ([40.0] * 48 + [70.0]) * 4) == [1] * 196
+def test_a_search_now_and_then_does_not_keep_detail_out_but_many_frames_without_room_do():
+    for spacing, rungs in ((8, [1] * 196), (12, [1] * 49 + [0] * 147)):
+        ladder = Ladder(2, 100.0)
+        climbed(ladder, [150.0] * 5)
+        assert climbed(ladder, ([40.0] * (spacing - 1) + [70.0]) * 30)[:196] == rungs
 
 
 def test_what_a_rung_saves_is_no_reason_to_go_back_and_forth():

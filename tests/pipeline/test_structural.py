@@ -27,7 +27,7 @@ from ortholoc_edge.pipeline.localizer import Localizer, LocalizerOptions
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.prior import PosePrior, RegionPrior
 from ortholoc_edge.pipeline.render import Terrain, render
-from ortholoc_edge.pipeline.structural import TUNING, QueryMaker, Track, Tracking
+from ortholoc_edge.pipeline.structural import LADDER, TUNING, QueryMaker, Track, Tracking, Tuning
 from ortholoc_edge.pipeline.trace import Trace
 from ortholoc_edge.tiles.georeference import LocalFrame
 from ortholoc_edge.tiles.pack import Pack
@@ -482,8 +482,10 @@ def predicted(terrain: Terrain, truth: Rigid3, scale: float = 1.0) -> PosePrior:
     return PosePrior(terrain.local.map_from_local_pose(off), covariance)
 
 
-def track(terrain: Terrain, grey: ImageArray, prior: PosePrior, camera: Camera = CAMERA) -> Track | None:
-    return Tracking(QueryMaker(camera).fields(grey), terrain, prior, camera, Trace()).run()
+def track(
+    terrain: Terrain, grey: ImageArray, prior: PosePrior, camera: Camera = CAMERA, tuning: Tuning = TUNING
+) -> Track | None:
+    return Tracking(QueryMaker(camera, tuning).fields(grey), terrain, prior, camera, Trace(), tuning).run()
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 30.0, 55.0])
@@ -547,15 +549,16 @@ def orchard(window: MapWindow) -> None:
     window.dsm[:] = GROUND_M
 
 
-def test_a_pattern_that_repeats_has_a_rival() -> None:
+@pytest.mark.parametrize("tuning", LADDER, ids=["512", "384", "256"])
+def test_a_pattern_that_repeats_has_a_rival(tuning: Tuning) -> None:
     """Whatever place it is given, one row further fits as well."""
     trees, truth = painted(holes=orchard), camera_at()
-    found = track(trees, render(trees, CAMERA, truth).image, predicted(trees, truth))
+    found = track(trees, render(trees, CAMERA, truth).image, predicted(trees, truth), tuning=tuning)
     assert found is not None
     assert found.convincing
     assert found.rival > GateOptions().max_rival
     blots = painted()
-    alone = track(blots, render(blots, CAMERA, truth).image, predicted(blots, truth))
+    alone = track(blots, render(blots, CAMERA, truth).image, predicted(blots, truth), tuning=tuning)
     assert alone is not None
     assert alone.rival < 0.5 * GateOptions().max_rival
 
