@@ -44,7 +44,7 @@ class GateOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     # many sigmas.
     sure_support: Annotated[float, Meta(ge=0, le=1)] = 0.15
     unsure_innovation_sigmas: Annotated[float, Meta(gt=0)] = 3.0
-    # Convex hull of the inliers over the image's area.
+    # Convex hull of the inliers over the image's area; half of it for structural matching.
     min_spread: Annotated[float, Meta(ge=0, le=1)] = 0.12
     # Root mean square of the inliers over the inlier threshold; uniform outliers give 0.71.
     max_rms_ratio: Annotated[float, Meta(gt=0, le=1)] = 0.65
@@ -128,11 +128,18 @@ def lenient(options: GateOptions, part: float) -> GateOptions:
 
 
 def for_structure(support: float, options: GateOptions) -> GateOptions:
-    """The limits for a pose of structural matching with so much support: its contrast stands for counts."""
+    """The limits for a pose of structural matching with so much support: its contrast stands for counts, and the
+    prior's attitude, which is in it, for half of the spread."""
     sigmas = options.max_innovation_sigmas
     if support < options.sure_support:
         sigmas = min(sigmas, options.unsure_innovation_sigmas)
-    return structs.replace(options, min_inliers=6, min_inlier_ratio=0.0, max_innovation_sigmas=sigmas)
+    return structs.replace(
+        options,
+        min_inliers=6,
+        min_inlier_ratio=0.0,
+        min_spread=0.5 * options.min_spread,
+        max_innovation_sigmas=sigmas,
+    )
 
 
 def well_spread(estimate: PoseEstimate, query_px: FloatArray, options: GateOptions) -> Refusal | None:

@@ -208,4 +208,5 @@ def test_contrast_and_support_stand_for_counts():
     assert refused.reason is Reason.LOW_CONTRAST
     sure, unsure = (gate.for_structure(support, options) for support in (0.15, 0.149))
     assert sure.min_inlier_ratio == unsure.min_inlier_ratio == 0.0
+    assert sure.min_spread == 0.5 * options.min_spread
     assert (sure.max_innovation_sigmas, unsure.max_innovation_sigmas) == (5.0, 3.0)

@@ -305,7 +305,6 @@ def test_a_region_is_no_prediction() -> None:
         (rendered.prior(NADIR, sigma_m=(16.0, 60.0)), {"max_window_mpx": 0.001}, Reason.PRIOR_TOO_WIDE),
         (rendered.prior(NADIR), {"gate": GateOptions(min_contrast=500.0)}, Reason.LOW_CONTRAST),
         (rendered.prior(NADIR), {"gate": GateOptions(max_relative_sigma=1e-5)}, Reason.UNCERTAIN),
-        (rendered.prior(NADIR), {"gate": GateOptions(min_spread=1.0)}, Reason.POOR_SPREAD),
     ],
 )
 def test_reasons(prior: PosePrior, options: dict[str, object], reason: Reason) -> None:
