@@ -34,10 +34,10 @@ class GateOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     min_inliers: Annotated[int, Meta(ge=6)] = 30
     min_inlier_ratio: Annotated[float, Meta(ge=0, le=1)] = 0.20
     # Of structural matching, in place of the two above: how much better the view fits at the pose than beside it, in
-    # sigmas. Of 541 right poses, two thirds of them of another season, 99 % have 6.8 or more; of 101 wrong ones of
-    # 1136 frames shown where they do not belong all but one have 4.5 or less, and the one has a rival
-    # (docs/studies/structural.md, "Contrast").
-    min_contrast: Annotated[float, Meta(ge=0)] = 6.5
+    # sigmas. Of 542 right poses, two thirds of them of another season, 99 % have 5.9 or more; of 92 wrong ones of 2132
+    # frames shown where they do not belong none without a rival had more than 4.6 (docs/studies/structural.md,
+    # "Contrast").
+    min_contrast: Annotated[float, Meta(ge=0)] = 6.0
     # Inliers of the best pose elsewhere within the prior, as a part of this one's.
     max_rival: Annotated[float, Meta(ge=0)] = 0.6
     # Part of the patches in view that agree with the pose, below which it must be where it was expected, within so
