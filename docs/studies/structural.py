@@ -90,7 +90,7 @@ def level_drawn_once(
     )
     step = self._adjusted(number, view, found, template, known, pose, whole)
     last = len(self._tuning.levels) - 1
-    return step if step is None or number < last else self._polished(view, found, known, step)
+    return step if step is None or number < last else self._polished(view, found, known, step, structural._SAMPLES)
 
 
 def variants() -> Iterator[Variant]:
