@@ -34,14 +34,14 @@ class GateOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     min_inliers: Annotated[int, Meta(ge=6)] = 30
     min_inlier_ratio: Annotated[float, Meta(ge=0, le=1)] = 0.20
     # Of structural matching, in place of the two above: how much better the view fits at the pose than beside it, in
-    # sigmas. Of 542 right poses, two thirds of them of another season, 99 % have 5.9 or more; of 92 wrong ones of 2132
-    # frames shown where they do not belong none without a rival had more than 4.6 (docs/studies/structural.md,
-    # "Contrast").
-    min_contrast: Annotated[float, Meta(ge=0)] = 6.0
+    # sigmas, and the part of the patches in view that agree. Of 542 right poses, two thirds of them of another season,
+    # 99 % have 5.9 and 0.047 or more; of the wrong ones of 10,000 hostile frames the only one above 6.0, two parallel
+    # roads upside down, had 6.2 and 0.033 (docs/studies/structural.md, "Contrast").
+    min_contrast: Annotated[float, Meta(ge=0)] = 6.5
+    min_support: Annotated[float, Meta(ge=0, le=1)] = 0.04
     # Inliers of the best pose elsewhere within the prior, as a part of this one's.
     max_rival: Annotated[float, Meta(ge=0)] = 0.6
-    # Part of the patches in view that agree with the pose, below which it must be where it was expected, within so
-    # many sigmas.
+    # Support below which the pose must be where it was expected, within so many sigmas.
     sure_support: Annotated[float, Meta(ge=0, le=1)] = 0.15
     unsure_innovation_sigmas: Annotated[float, Meta(gt=0)] = 3.0
     # Convex hull of the inliers over the image's area; half of it for structural matching.
@@ -108,6 +108,13 @@ def with_contrast(contrast: float, options: GateOptions) -> Refusal | None:
     """At a wrong pose all patches together fit no better than beside it, even where some agree by chance."""
     if not contrast >= options.min_contrast:
         return Refusal(Reason.LOW_CONTRAST, "fit of the view over that beside it", contrast, options.min_contrast)
+    return None
+
+
+def with_support(support: float, options: GateOptions) -> Refusal | None:
+    """What fits only where a road or two run the right way has contrast, but hardly a patch that finds its place."""
+    if not support >= options.min_support:
+        return Refusal(Reason.LOW_INLIER_RATIO, "part of the patches in view that agree", support, options.min_support)
     return None
 
 

@@ -262,8 +262,10 @@ class Localizer:
         if found is None:
             raise RejectedError(Reason.FEW_MATCHES, "the map in the predicted view looks nothing like the frame")
         with trace.stage("gate"):
-            refusal = gate.with_contrast(found.contrast, self._options.gate) or gate.without_rival(
-                found.rival, self._options.gate
+            refusal = (
+                gate.with_contrast(found.contrast, self._options.gate)
+                or gate.with_support(found.support, self._options.gate)
+                or gate.without_rival(found.rival, self._options.gate)
             )
             if refusal is not None:
                 raise RejectedError(refusal.reason, refusal.detail, refusal.measured, refusal.limit)

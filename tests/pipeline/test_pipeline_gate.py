@@ -206,6 +206,12 @@ def test_contrast_and_support_stand_for_counts():
     refused = gate.with_contrast(options.min_contrast - 0.1, options)
     assert refused is not None
     assert refused.reason is Reason.LOW_CONTRAST
+    assert gate.with_support(options.min_support, options) is None
+    refused = gate.with_support(options.min_support - 0.001, options)
+    assert refused is not None
+    assert refused.reason is Reason.LOW_INLIER_RATIO
+    for test in (gate.with_contrast, gate.with_support, gate.without_rival):
+        assert test(float("nan"), options) is not None
     sure, unsure = (gate.for_structure(support, options) for support in (0.15, 0.149))
     assert sure.min_inlier_ratio == unsure.min_inlier_ratio == 0.0
     assert sure.min_spread == 0.5 * options.min_spread
