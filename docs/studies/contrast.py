@@ -36,7 +36,7 @@ from ortholoc_edge.tiles.store import MapStore
 
 NOISE = PriorNoise((1.0, 1.0, 3.0), (Length(of_height=0.06), Length(of_height=0.04)))
 OPEN = gate.GateOptions(
-    min_contrast=0.0, min_support=0.0, max_rival=1e9, min_spread=0.0, max_rms_ratio=1.0, max_innovation_sigmas=1e9,
+    min_contrast=0.0, min_sure_contrast=0.0, min_support=0.0, max_rival=1e9, min_spread=0.0, max_rms_ratio=1.0, max_innovation_sigmas=1e9,
     unsure_innovation_sigmas=1e9, max_relative_sigma=1e9,
 )  # fmt: skip
 # Of a right pose, m and deg; of one that is neither right nor wrong; apart, of frames of another place.
@@ -60,7 +60,7 @@ def judged(localizer: Localizer, kind: str, image: Any, prior: PosePrior, truth:
     seen: dict[str, float] = {}
 
     def note(name: str) -> Any:
-        return lambda value, options: seen.update({name: value})
+        return lambda value, *others: seen.update({name: value})
 
     before = gate.with_contrast, gate.without_rival
     gate.with_contrast, gate.without_rival = note("contrast"), note("rival")

@@ -39,6 +39,8 @@ class GateOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     # roads upside down, had 6.2 and 0.033 (docs/studies/structural.md, "Contrast").
     min_contrast: Annotated[float, Meta(ge=0)] = 6.5
     min_support: Annotated[float, Meta(ge=0, le=1)] = 0.04
+    # Contrast that is enough with ``sure_support``: oblique views have less of it, for their far parts show little.
+    min_sure_contrast: Annotated[float, Meta(ge=0)] = 5.0
     # Inliers of the best pose elsewhere within the prior, as a part of this one's.
     max_rival: Annotated[float, Meta(ge=0)] = 0.6
     # Support below which the pose must be where it was expected, within so many sigmas.
@@ -104,10 +106,11 @@ def enough_inliers(estimate: PoseEstimate, options: GateOptions) -> Refusal | No
     return None
 
 
-def with_contrast(contrast: float, options: GateOptions) -> Refusal | None:
+def with_contrast(contrast: float, support: float, options: GateOptions) -> Refusal | None:
     """At a wrong pose all patches together fit no better than beside it, even where some agree by chance."""
-    if not contrast >= options.min_contrast:
-        return Refusal(Reason.LOW_CONTRAST, "fit of the view over that beside it", contrast, options.min_contrast)
+    limit = options.min_contrast if support < options.sure_support else options.min_sure_contrast
+    if not contrast >= limit:
+        return Refusal(Reason.LOW_CONTRAST, "fit of the view over that beside it", contrast, limit)
     return None
 
 

@@ -263,7 +263,7 @@ class Localizer:
             raise RejectedError(Reason.FEW_MATCHES, "the map in the predicted view looks nothing like the frame")
         with trace.stage("gate"):
             refusal = (
-                gate.with_contrast(found.contrast, self._options.gate)
+                gate.with_contrast(found.contrast, found.support, self._options.gate)
                 or gate.with_support(found.support, self._options.gate)
                 or gate.without_rival(found.rival, self._options.gate)
             )

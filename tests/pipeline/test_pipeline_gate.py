@@ -202,15 +202,18 @@ def test_only_inliers_count_for_the_spread():
 
 def test_contrast_and_support_stand_for_counts():
     options = gate.GateOptions()
-    assert gate.with_contrast(options.min_contrast, options) is None
-    refused = gate.with_contrast(options.min_contrast - 0.1, options)
-    assert refused is not None
-    assert refused.reason is Reason.LOW_CONTRAST
+    for support, least in ((0.14, options.min_contrast), (0.15, options.min_sure_contrast)):
+        assert gate.with_contrast(least, support, options) is None
+        refused = gate.with_contrast(least - 0.1, support, options)
+        assert refused is not None
+        assert refused.reason is Reason.LOW_CONTRAST
+        assert refused.limit == least
+        assert gate.with_contrast(float("nan"), support, options) is not None
     assert gate.with_support(options.min_support, options) is None
     refused = gate.with_support(options.min_support - 0.001, options)
     assert refused is not None
     assert refused.reason is Reason.LOW_INLIER_RATIO
-    for test in (gate.with_contrast, gate.with_support, gate.without_rival):
+    for test in (gate.with_support, gate.without_rival):
         assert test(float("nan"), options) is not None
     sure, unsure = (gate.for_structure(support, options) for support in (0.15, 0.149))
     assert sure.min_inlier_ratio == unsure.min_inlier_ratio == 0.0

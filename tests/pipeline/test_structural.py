@@ -303,7 +303,7 @@ def test_a_region_is_no_prediction() -> None:
         (rendered.prior(FAR), {}, Reason.OUTSIDE_MAP),
         (rendered.prior(NADIR, (0, 0, -150.0)), {}, Reason.PRIOR_DISAGREES),
         (rendered.prior(NADIR, sigma_m=(16.0, 60.0)), {"max_window_mpx": 0.001}, Reason.PRIOR_TOO_WIDE),
-        (rendered.prior(NADIR), {"gate": GateOptions(min_contrast=500.0)}, Reason.LOW_CONTRAST),
+        (rendered.prior(NADIR), {"gate": GateOptions(min_sure_contrast=500.0)}, Reason.LOW_CONTRAST),
         (rendered.prior(NADIR), {"gate": GateOptions(max_relative_sigma=1e-5)}, Reason.UNCERTAIN),
     ],
 )
