@@ -62,7 +62,7 @@ class Tuning:
 
 
 TUNING = Tuning()
-# From full detail to what a throttled processor can still do (docs/studies/structural.md: "384 px", "256 px").
+# From full detail to what a throttled processor can still do (docs/studies/structural.md: "Ladder").
 LADDER = (
     TUNING,
     replace(TUNING, levels=(*TUNING.levels[:2], Level(384, 2, 12, 3))),
