@@ -450,7 +450,7 @@ class Tracking:
         Args:
             samples: independent ones of a patch.
         """
-        pose = step.adjusted.local_from_camera
+        pose = step.pose
         points, shown = view.points_local(found.template_px), _shown(view, found.template_px)
         for _ in range(_POLISHES):
             shift, jacobian = linearised(points, found.template_px, view.camera, pose)
@@ -573,7 +573,7 @@ class Tracking:
         scale = self._camera.width / camera.width, self._camera.height / camera.height
         errors = np.nan_to_num(np.linalg.norm(last.adjusted.residuals_px * scale, axis=1), nan=np.inf)
         estimate = PoseEstimate(
-            last.adjusted.local_from_camera,
+            last.pose,
             self._camera,
             covariance,
             last.inliers,

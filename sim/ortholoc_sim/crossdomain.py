@@ -318,12 +318,14 @@ class CrossDomain:
         else:
             tilt_deg = rng.uniform(*self.flown_as.tilt_deg)
         roll, yaw = np.radians(rng.normal(0.0, _ROLL_SIGMA_DEG)), rng.uniform(-np.pi, np.pi)
+        return self._posed(xy, self._ground(xy) + height_m, (float(roll), float(np.radians(tilt_deg)), float(yaw)))
+
+    def _posed(self, xy: FloatArray, above_m: float, angles_rad: tuple[float, float, float]) -> Rigid3:
+        """Of the camera below a vehicle at a place (2,) and height of the map, with its roll, pitch and yaw."""
         # From grid north: the map's axes stand in for north, east, down.
-        ned_from_body = rotation.from_euler(float(roll), float(np.radians(tilt_deg)), float(yaw))
+        ned_from_body = rotation.from_euler(*angles_rad)
         map_from_camera = frames.map_from_ned_rotation(0.0) @ ned_from_body @ frames.BODY_FROM_NADIR_CAMERA
-        ground_m = self._ground(xy)
-        eye = np.array([xy[0] + self.place.west_m, xy[1] + self.place.south_m, ground_m + height_m])
-        return Rigid3(map_from_camera, eye)
+        return Rigid3(map_from_camera, np.array([xy[0] + self.place.west_m, xy[1] + self.place.south_m, above_m]))
 
     def _lap(self, spacing_m: float, count: int) -> list[Rigid3]:
         """Along an ellipse in the middle of the place, banked as its curvature needs."""
@@ -333,7 +335,8 @@ class CrossDomain:
         flown_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(around, axis=0), axis=1))])
         at = np.interp(spacing_m * np.arange(count) % flown_m[-1], flown_m, turns)
         rng = np.random.default_rng([self.seed, 117])
-        ground_m = float(np.median(self.place.world.terrain))
+        above_m = float(np.median(self.place.world.terrain)) + float(np.mean(self.flown_as.height_m))
+        tilt = np.radians(0.0 if self.flown_as.tilt_deg is None else np.mean(self.flown_as.tilt_deg))
         poses = []
         for turn in at:
             xy = 0.5 * np.array([self.width_m, self.height_m]) + axes * (np.cos(turn), np.sin(turn))
@@ -341,14 +344,8 @@ class CrossDomain:
             radius_m = float(np.linalg.norm(ahead)) ** 3 / float(axes[0] * axes[1])
             bank = -np.arctan2(LAP_SPEED_M_S**2, 9.81 * radius_m)  # to the left, the lap's inside
             roll, pitch, yaw = np.radians(rng.normal(0.0, _LAP_JITTER_DEG, 3))
-            tilt = np.radians(0.0 if self.flown_as.tilt_deg is None else np.mean(self.flown_as.tilt_deg))
-            ned_from_body = rotation.from_euler(
-                float(bank + roll), float(tilt + pitch), float(np.arctan2(ahead[0], ahead[1]) + yaw)
-            )
-            pose = frames.map_from_ned_rotation(0.0) @ ned_from_body @ frames.BODY_FROM_NADIR_CAMERA
-            height_m = float(np.mean(self.flown_as.height_m))
-            eye = np.array([xy[0] + self.place.west_m, xy[1] + self.place.south_m, ground_m + height_m])
-            poses.append(Rigid3(pose, eye))
+            heading = float(np.arctan2(ahead[0], ahead[1]) + yaw)
+            poses.append(self._posed(xy, above_m, (float(bank + roll), float(tilt + pitch), heading)))
         if not all(self._inside(pose) for pose in poses):
             raise ValueError(f"{self.width_m:.0f} x {self.height_m:.0f} m have no room for a lap; take a larger place")
         return poses
