@@ -21,13 +21,6 @@ from typing import Generic, TypeVar
 from ortholoc_edge.adapters import systemd
 from ortholoc_edge.adapters.bus import Bus
 from ortholoc_edge.adapters.camera import BadFrameError, EndOfFrames, FrameSource, open_source
-from ortholoc_edge.adapters.estimates import (
-    EarthModel,
-    GeodeticOrigin,
-    VisionEstimate,
-    earth_model,
-    ned_from_geodetic,
-)
 from ortholoc_edge.adapters.mavlink import (
     AutopilotLink,
     AutopilotState,
@@ -35,6 +28,13 @@ from ortholoc_edge.adapters.mavlink import (
     Severity,
     Statistic,
     SystemStatus,
+)
+from ortholoc_edge.adapters.mavlink.estimates import (
+    EarthModel,
+    GeodeticOrigin,
+    VisionEstimate,
+    earth_model,
+    ned_from_geodetic,
 )
 from ortholoc_edge.adapters.recorder import Recorder
 from ortholoc_edge.clock import Clock, SystemClock

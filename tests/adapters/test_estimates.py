@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 from pyproj import Geod
 
-from ortholoc_edge.adapters.estimates import (
+from ortholoc_edge.adapters.mavlink.estimates import (
     Autopilot,
     CovarianceLayout,
     EarthModel,

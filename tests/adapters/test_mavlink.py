@@ -17,18 +17,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from ortholoc_edge.adapters.estimates import Autopilot, GeodeticOrigin, VisionEstimate
-from ortholoc_edge.adapters.mavlink import (
-    AutopilotLink,
-    FrameParser,
-    LinkOptions,
-    LinkProtocol,
-    Severity,
-    SystemStatus,
-    TimeHistory,
-    TimeSync,
-    parse_endpoint,
-)
+from ortholoc_edge.adapters.mavlink import AutopilotLink, LinkOptions, Severity, SystemStatus
+from ortholoc_edge.adapters.mavlink.codec import FrameParser
+from ortholoc_edge.adapters.mavlink.estimates import Autopilot, GeodeticOrigin, VisionEstimate
+from ortholoc_edge.adapters.mavlink.history import TimeHistory
+from ortholoc_edge.adapters.mavlink.options import parse_endpoint
+from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol
+from ortholoc_edge.adapters.mavlink.timesync import TimeSync
 from ortholoc_edge.clock import SystemClock
 from ortholoc_edge.errors import ConfigError, LinkError
 from ortholoc_edge.geometry import rotation

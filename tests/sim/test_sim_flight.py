@@ -19,8 +19,10 @@ from ortholoc_sim.vehicle import Vehicle, VehicleOptions, attitude_of
 from ortholoc_sim.world import WorldSpec
 
 from ortholoc_edge.adapters.camera import EndOfFrames
-from ortholoc_edge.adapters.estimates import VisionEstimate
-from ortholoc_edge.adapters.mavlink import FrameParser, LinkOptions, LinkProtocol
+from ortholoc_edge.adapters.mavlink import LinkOptions
+from ortholoc_edge.adapters.mavlink.codec import FrameParser
+from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate
+from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.pipeline.frame import Frame

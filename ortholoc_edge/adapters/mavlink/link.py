@@ -1,0 +1,345 @@
+"""The thread that owns the link to the autopilot."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import select
+import socket
+import threading
+from collections import Counter, deque
+from types import TracebackType
+from typing import Any
+
+from ortholoc_edge.adapters.mavlink.codec import FrameParser, MavlinkMessage, dialect
+from ortholoc_edge.adapters.mavlink.estimates import GeodeticOrigin, VisionEstimate
+from ortholoc_edge.adapters.mavlink.log import LimitedLog
+from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus, parse_endpoint
+from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol, Statistic
+from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity, AutopilotState
+from ortholoc_edge.adapters.mavlink.transport import Transport, open_transport
+from ortholoc_edge.clock import Clock
+from ortholoc_edge.errors import LinkError
+
+logger = logging.getLogger(__name__)
+
+_S = 1_000_000_000
+
+# A TCP peer that stays mute this long is taken for half open: its end is gone and nobody told us.
+_TCP_SILENCE_NS = 10 * _S
+_BACKOFF_MIN_S, _BACKOFF_MAX_S = 0.5, 10.0
+_SELECT_TIMEOUT_S = 0.05
+_GIVE_UP_AFTER_ERRORS = 10
+
+
+class AutopilotLink:
+    """The daemon's side of the link; every method may be called from any thread.
+
+    Nothing is raised once started: a link that is down shows in :meth:`statistics`, in ``state_at(...)`` and
+    in the log, and is opened again with a growing pause. If the thread meets a defect of our own again and
+    again it ends, and :attr:`failure` says why; the daemon should then end too.
+    """
+
+    def __init__(self, options: LinkOptions, clock: Clock) -> None:
+        """Raises: ConfigError if the endpoint can't be understood."""
+        self._endpoint = parse_endpoint(options.endpoint)
+        self._options, self._clock = options, clock
+        self._protocol = LinkProtocol(options)
+        self._mav = dialect.MAVLink(None, 0, options.component_id)
+        self._lock = threading.Lock()
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._transport: Transport | None = None
+        self._wake_pair: tuple[socket.socket, socket.socket] | None = None
+        self._estimate: VisionEstimate | None = None
+        self._texts: deque[MavlinkMessage] = deque(maxlen=16)
+        self._text_id = 0
+        self._log = LimitedLog()
+        self._counts: Counter[str] = Counter()
+        self._parsers: dict[Any, FrameParser] = {}
+        self._retired = Counter[str]()
+        self._open_ok = False
+        self._peer_is_vehicle = False
+        self.failure: BaseException | None = None
+
+    def __enter__(self) -> AutopilotLink:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def start(self, open_now: bool = False) -> None:
+        """Start the thread. A device that is not there yet is waited for.
+
+        Args:
+            open_now: open the device here and now instead.
+        Raises: LinkError if ``open_now`` and it can't be opened.
+        """
+        if self._thread is not None:
+            raise RuntimeError("this link was started before; make a new one")
+        if open_now:
+            try:
+                self._transport = open_transport(self._endpoint)
+            except OSError as error:
+                raise LinkError(
+                    f"link endpoint {self._options.endpoint} can't be opened: {error}; check that the device "
+                    "exists, is not in use, and that the user may open it"
+                ) from error
+        receiver, sender = self._wake_pair = socket.socketpair()
+        receiver.setblocking(False)
+        sender.setblocking(False)
+        self._thread = threading.Thread(
+            target=self._run, args=(receiver,), name="autopilot-link", daemon=True
+        )
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread and close the device. Idempotent."""
+        self._stop.set()
+        self._wake()
+        if self._thread is not None:
+            self._thread.join(timeout=5.0)
+            if self._thread.is_alive():
+                logger.error("the autopilot link's thread did not end within 5 s; its device stays open")
+                return
+        if self._transport is not None:
+            self._transport.close()
+            self._transport = None
+        for end in self._wake_pair or ():
+            end.close()
+
+    def is_alive(self) -> bool:
+        """Whether the thread runs."""
+        return self._thread is not None and self._thread.is_alive()
+
+    @property
+    def vehicle(self) -> AutopilotIdentity | None:
+        """The autopilot found, or None so far."""
+        with self._lock:
+            return self._protocol.vehicle
+
+    def connected(self) -> bool:
+        """Whether the autopilot's heartbeat came within 3 s."""
+        with self._lock:
+            return self._protocol.connected(self._clock.now_ns())
+
+    def state_at(self, stamp_ns: int) -> AutopilotState | None:
+        """What the autopilot knew at a stamp of our clock; None before an autopilot was found.
+
+        Attitude is interpolated on the sphere, or carried on by its rates up to 0.2 s beyond the history; it
+        is never merely the latest. Parts that are not known at that stamp are None.
+        """
+        with self._lock:
+            return self._protocol.state_at(stamp_ns)
+
+    def send_estimate(self, estimate: VisionEstimate) -> None:
+        """Hand an estimate over. One that was not sent yet is replaced and counted: newer is better."""
+        with self._lock:
+            if self._estimate is not None:
+                self._counts["estimates_dropped"] += 1
+            self._estimate = estimate
+        self._wake()
+
+    def send_status_text(self, severity: Severity, text: str) -> None:
+        """Show a line at the ground station. Cut at 200 characters; of more than 16 waiting parts the oldest
+        go."""
+        data = text.encode("ascii", "replace")[:200]
+        parts = [data[i : i + 50] for i in range(0, len(data), 50)] or [b""]
+        with self._lock:
+            # Id 0 says that a text is whole; others tie its parts together.
+            self._text_id = self._text_id % 65535 + 1
+            for i, part in enumerate(parts):
+                if len(self._texts) == self._texts.maxlen:
+                    self._counts["texts_dropped"] += 1
+                self._texts.append(
+                    dialect.MAVLink_statustext_message(
+                        severity=int(severity),
+                        text=part,
+                        id=self._text_id if len(parts) > 1 else 0,
+                        chunk_seq=i,
+                    )
+                )
+        self._wake()
+
+    def set_system_status(self, status: SystemStatus) -> None:
+        """What the next HEARTBEAT says."""
+        with self._lock:
+            self._protocol.system_status = status
+
+    def offer_origin(self, origin: GeodeticOrigin) -> None:
+        """Set the EKF origin if the autopilot turns out to have none and ``options.set_origin`` allows it.
+
+        Repeated until the autopilot tells an origin. That one counts, whether it is ours or not.
+        """
+        with self._lock:
+            self._protocol.offer_origin(origin)
+
+    def statistics(self) -> dict[str, Statistic]:
+        """Counters since the start, flat: ``sent.NAME``, ``received.NAME``, ``bad_frames``, ``reconnects``
+        ..."""
+        with self._lock:
+            parsers = list(self._parsers.values())
+            return {
+                "open": self._open_ok,
+                "reconnects": self._counts["reconnects"],
+                "estimates_dropped": self._counts["estimates_dropped"],
+                **self._counts,
+                "bad_frames": self._retired["bad_frames"] + sum(p.bad_frames for p in parsers),
+                "bad_bytes": self._retired["bad_bytes"] + sum(p.bad_bytes for p in parsers),
+                "unknown_frames": self._retired["unknown_frames"] + sum(p.unknown_frames for p in parsers),
+                **self._protocol.statistics(self._clock.now_ns()),
+            }
+
+    # -- in the thread --------------------
+
+    def _wake(self) -> None:
+        # Full: it is about to wake anyway. Closed: there is nothing to wake.
+        if self._wake_pair is not None:
+            with contextlib.suppress(OSError):
+                self._wake_pair[1].send(b"\0")
+
+    def _run(self, wake_receiver: socket.socket) -> None:
+        try:
+            self._connect_and_serve(wake_receiver)
+        except BaseException as error:
+            self.failure = error
+            logger.exception("the autopilot link ends")
+
+    def _connect_and_serve(self, wake_receiver: socket.socket) -> None:
+        backoff_s = _BACKOFF_MIN_S
+        while not self._stop.is_set():
+            try:
+                if self._transport is None:
+                    self._transport = open_transport(self._endpoint)
+            except OSError as error:
+                self._counts["open_failures"] += 1
+                self._log(
+                    self._clock.now_ns(),
+                    logging.WARNING,
+                    "open",
+                    f"link endpoint {self._options.endpoint} can't be opened: {error}; trying again",
+                )
+                self._stop.wait(backoff_s)
+                backoff_s = min(2.0 * backoff_s, _BACKOFF_MAX_S)
+                continue
+            logger.info("link open: %s", self._options.endpoint)
+            self._open_ok = True
+            before = self._counts["messages"]
+            try:
+                self._serve(self._transport, wake_receiver)
+            except OSError as error:
+                self._counts["reconnects"] += 1
+                self._log(
+                    self._clock.now_ns(),
+                    logging.WARNING,
+                    "lost",
+                    f"link {self._options.endpoint} lost: {error}; opening again",
+                )
+            self._open_ok = False
+            with self._lock:
+                for parser in self._parsers.values():
+                    self._retire(parser)
+                self._parsers.clear()
+                self._peer_is_vehicle = False
+            self._transport.close()
+            self._transport = None
+            if not self._stop.is_set():
+                # A peer that accepts and hangs up at once must not be called upon without end.
+                if self._counts["messages"] > before:
+                    backoff_s = _BACKOFF_MIN_S
+                self._stop.wait(backoff_s)
+                backoff_s = min(2.0 * backoff_s, _BACKOFF_MAX_S)
+
+    def _serve(self, transport: Transport, wake_receiver: socket.socket) -> None:
+        errors_in_a_row = 0
+        last_heard_ns: int | None = None
+        while not self._stop.is_set():
+            writers = [transport] if transport.pending() else []
+            readers: list[Transport | socket.socket] = [transport, wake_receiver]
+            readable, writable, _ = select.select(readers, writers, [], _SELECT_TIMEOUT_S)
+            if wake_receiver in readable:
+                with contextlib.suppress(BlockingIOError):
+                    wake_receiver.recv(4096)
+            if writable:
+                transport.flush()
+            now_ns = self._clock.now_ns()
+            arrived = transport.receive() if transport in readable else []
+            if arrived:
+                last_heard_ns = now_ns
+            elif (
+                self._endpoint.kind == "tcp"
+                and last_heard_ns is not None
+                and now_ns - last_heard_ns > _TCP_SILENCE_NS
+            ):
+                raise ConnectionError(f"nothing came for {_TCP_SILENCE_NS // _S} s")
+            try:
+                for data, peer in arrived:
+                    self._take(transport, data, peer, now_ns)
+                self._say(transport)
+                errors_in_a_row = 0
+            except OSError:
+                raise
+            except Exception:
+                # A defect of ours must not take attitude and estimates from the vehicle; unless it stays.
+                self._counts["internal_errors"] += 1
+                errors_in_a_row += 1
+                if errors_in_a_row >= _GIVE_UP_AFTER_ERRORS:
+                    raise
+                logger.exception("autopilot link: one item was left out")
+
+    def _take(self, transport: Transport, data: bytes, peer: Any, now_ns: int) -> None:
+        with self._lock:
+            parser = self._parsers.get(peer)
+            if parser is None:
+                # Any host can send us datagrams, each with a parser of its own; the oldest goes.
+                if len(self._parsers) >= 8:
+                    self._retire(self._parsers.pop(next(iter(self._parsers))))
+                parser = self._parsers[peer] = FrameParser()
+        for message in parser.feed(data, now_ns):
+            self._counts["messages"] += 1
+            with self._lock:
+                answers = self._protocol.on_message(message, now_ns)
+                vehicle = self._protocol.vehicle
+            # Replies go where our autopilot is. Until it was heard, to whoever speaks MAVLink.
+            ours = vehicle is not None and message.get_srcSystem() == vehicle.system_id
+            if ours and self._protocol.is_vehicle_heartbeat(message):
+                transport.prefer(peer)
+                self._peer_is_vehicle = True
+            elif not self._peer_is_vehicle:
+                transport.prefer(peer)
+            for answer in answers:
+                self._send(transport, answer)
+
+    def _retire(self, parser: FrameParser) -> None:
+        for name in ("bad_frames", "bad_bytes", "unknown_frames"):
+            self._retired[name] += getattr(parser, name)
+
+    def _say(self, transport: Transport) -> None:
+        now_ns = self._clock.now_ns()
+        with self._lock:
+            messages = self._protocol.poll(now_ns)
+            # While bytes wait, an estimate stays in its slot, where a newer one can still replace it.
+            if self._estimate is not None and not transport.pending():
+                estimate, self._estimate = self._estimate, None
+                encoded = self._protocol.encode_estimate(estimate) if self._protocol.connected(now_ns) else []
+                if not encoded:
+                    self._counts["estimates_dropped"] += 1
+                messages = encoded + messages
+            while self._texts:
+                messages.append(self._texts.popleft())
+        for message in messages:
+            self._send(transport, message)
+
+    def _send(self, transport: Transport, message: MavlinkMessage) -> None:
+        self._mav.srcSystem = self._protocol.own_system_id
+        frame = bytes(message.pack(self._mav))
+        if transport.send(frame):
+            self._mav.seq = (self._mav.seq + 1) % 256
+            self._counts[f"sent.{message.get_type()}"] += 1
+        else:
+            self._counts["unsent"] += 1
+            if message.get_type() in ("ODOMETRY", "VISION_POSITION_ESTIMATE"):
+                self._counts["estimates_dropped"] += 1

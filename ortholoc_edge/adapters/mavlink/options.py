@@ -1,0 +1,95 @@
+"""The link's configuration, and the names that MAVLink has for what a component says of itself."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Annotated, Literal
+
+import msgspec
+
+from ortholoc_edge.errors import ConfigError
+
+
+class SystemStatus(IntEnum):
+    """What our HEARTBEAT says of us (MAV_STATE)."""
+
+    BOOT = 1
+    STANDBY = 3
+    ACTIVE = 4
+    CRITICAL = 5
+
+
+class Severity(IntEnum):
+    """MAV_SEVERITY, for :meth:`AutopilotLink.send_status_text`."""
+
+    CRITICAL = 2
+    ERROR = 3
+    WARNING = 4
+    NOTICE = 5
+    INFO = 6
+
+
+class LinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The ``[link]`` table.
+
+    Attributes:
+        endpoint: ``udp:HOST:PORT`` listens there, ``udpout:HOST:PORT`` and ``tcp:HOST:PORT`` connect,
+            ``serial:/dev/ttyX:BAUD``. Below 460800 baud there is little room for ODOMETRY and time
+            synchronisation is poor.
+        system_id: ours and the vehicle's (a component shares the system id of its vehicle); 0 adopts that of
+            the first autopilot heard.
+        component_id: 197 is MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY.
+        send: which messages carry an estimate.
+        autopilot: overrides what the heartbeat says.
+        attitude_rate_hz, position_rate_hz: of ATTITUDE_QUATERNION and LOCAL_POSITION_NED, asked of the
+            autopilot.
+        set_origin: whether `AutopilotLink.offer_origin` may set the EKF origin of an autopilot that has none.
+    """
+
+    endpoint: str
+    system_id: Annotated[int, msgspec.Meta(ge=0, le=255)] = 0
+    component_id: Annotated[int, msgspec.Meta(ge=1, le=255)] = 197
+    send: tuple[Literal["vision_position_estimate", "odometry"], ...] = ("odometry",)
+    autopilot: Literal["auto", "ardupilot", "px4"] = "auto"
+    attitude_rate_hz: Annotated[float, msgspec.Meta(ge=1, le=400)] = 50.0
+    position_rate_hz: Annotated[float, msgspec.Meta(ge=1, le=100)] = 20.0
+    set_origin: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """Where the link goes. ``port`` is the baud rate of a serial line."""
+
+    kind: Literal["udp", "udpout", "tcp", "serial"]
+    address: str
+    port: int
+
+
+def _is_host(text: str) -> bool:
+    """Whether the socket module would take it for a name to look up: it raises UnicodeError for others."""
+    try:
+        text.strip("[]").encode("idna")
+    except UnicodeError:
+        return False
+    return not any(c.isspace() or c == "\0" for c in text)
+
+
+def parse_endpoint(text: str) -> Endpoint:
+    """Read ``LinkOptions.endpoint``. Raises: ConfigError that names the text and what is accepted."""
+    match = re.fullmatch(r"(udp|udpout|tcp|serial):(.+):(\d{1,8})", text)
+    number = int(match[3]) if match else 0
+    network = match is not None and match[1] != "serial"
+    if match is None or number == 0 or (network and (number > 65535 or not _is_host(match[2]))):
+        raise ConfigError(
+            f"link endpoint {text!r} can't be used; write udp:HOST:PORT (listen), udpout:HOST:PORT, "
+            "tcp:HOST:PORT or serial:/dev/ttyX:BAUD"
+        )
+    kinds: dict[str, Literal["udp", "udpout", "tcp", "serial"]] = {
+        "udp": "udp",
+        "udpout": "udpout",
+        "tcp": "tcp",
+        "serial": "serial",
+    }
+    return Endpoint(kinds[match[1]], match[2], number)
