@@ -802,7 +802,8 @@ def pair(request):
     else:
         wire = PtyWire()
         endpoint = f"serial:{wire.path}:921600"
-    return AutopilotLink(LinkOptions(endpoint=endpoint), SystemClock()), FakeAutopilot(wire)
+    # Each fix once, as it is: what is carried on is tested beside `Release`.
+    return AutopilotLink(LinkOptions(endpoint=endpoint, release="raw"), SystemClock()), FakeAutopilot(wire)
 
 
 def test_flight_over_a_real_wire(pair):
@@ -845,7 +846,7 @@ def test_hostile_bytes_and_half_frames(kind):
         endpoint = f"serial:{wire.path}:921600"
     autopilot = FakeAutopilot(wire)
     autopilot.noise_probability, autopilot.halve_probability = 0.3, 0.1
-    link = AutopilotLink(LinkOptions(endpoint=endpoint), SystemClock())
+    link = AutopilotLink(LinkOptions(endpoint=endpoint, release="raw"), SystemClock())
     with flying(link, autopilot):
         check_attitude(wait_for(lambda: good_state(link, back_ms=400)), autopilot)
         if kind == "udp":
@@ -874,7 +875,7 @@ def test_hostile_bytes_and_half_frames(kind):
 def test_nan_attitude_reboot_and_jump_in_flight():
     wire = UdpWire()
     autopilot = FakeAutopilot(wire)
-    link = AutopilotLink(LinkOptions(endpoint=f"udpout:127.0.0.1:{wire.port}"), SystemClock())
+    link = AutopilotLink(LinkOptions(endpoint=f"udpout:127.0.0.1:{wire.port}", release="raw"), SystemClock())
     with flying(link, autopilot):
         first = wait_for(lambda: good_state(link))
         autopilot.nan_attitude = True
@@ -899,7 +900,7 @@ def test_nan_attitude_reboot_and_jump_in_flight():
 def test_tcp_comes_back_after_the_peer_hung_up():
     wire = TcpWire()
     autopilot = FakeAutopilot(wire)
-    link = AutopilotLink(LinkOptions(endpoint=f"tcp:127.0.0.1:{wire.port}"), SystemClock())
+    link = AutopilotLink(LinkOptions(endpoint=f"tcp:127.0.0.1:{wire.port}", release="raw"), SystemClock())
     with flying(link, autopilot):
         wait_for(lambda: good_state(link))
         wire.drop()
@@ -913,7 +914,7 @@ def test_serial_line_pulled_out_and_put_back(tmp_path):
     device = tmp_path / "ttyVEHICLE"
     device.symlink_to(wire.path)
     autopilot = FakeAutopilot(wire)
-    link = AutopilotLink(LinkOptions(endpoint=f"serial:{device}:921600"), SystemClock())
+    link = AutopilotLink(LinkOptions(endpoint=f"serial:{device}:921600", release="raw"), SystemClock())
     link.start()
     try:
         wait_for(lambda: good_state(link))
@@ -952,7 +953,7 @@ def test_latest_estimate_wins_on_a_choked_line():
     slot."""
     wire = PtyWire()
     autopilot = FakeAutopilot(wire)
-    link = AutopilotLink(LinkOptions(endpoint=f"serial:{wire.path}:921600"), SystemClock())
+    link = AutopilotLink(LinkOptions(endpoint=f"serial:{wire.path}:921600", release="raw"), SystemClock())
     link.start()
     try:
         wait_for(lambda: good_state(link))

@@ -101,7 +101,7 @@ def config(source: str, endpoint: str, **more: Any) -> Config:
             width_px=camera.width, height_px=camera.height, fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy
         ),
         map=MapOptions(pack=str(rendered.store().pack.path)),
-        link=LinkOptions(endpoint=endpoint, send=("odometry", "vision_position_estimate")),
+        link=LinkOptions(endpoint=endpoint, send=("odometry", "vision_position_estimate"), release="raw"),
         matcher=MatcherOptions(name="sift", max_keypoints=2048),
         **more,
     )

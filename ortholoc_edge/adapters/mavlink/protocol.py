@@ -15,8 +15,12 @@ from ortholoc_edge.adapters.mavlink.estimates import (
     encode_odometry,
     encode_vision_position_estimate,
 )
+from ortholoc_edge.adapters.mavlink.latency import DelayAdvice, LatencyMeter, advise
 from ortholoc_edge.adapters.mavlink.log import LimitedLog
+from ortholoc_edge.adapters.mavlink.monitor import FusionMonitor, FusionReport
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus
+from ortholoc_edge.adapters.mavlink.release import Outgoing, Release
+from ortholoc_edge.adapters.mavlink.sources import PendingSwitch
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity, AutopilotState
 from ortholoc_edge.adapters.mavlink.streams import Repeat, Stream
 from ortholoc_edge.adapters.mavlink.telemetry import Telemetry
@@ -55,6 +59,11 @@ class LinkProtocol:
         self.timesync = TimeSync()
         self.counts: Counter[str] = Counter()
         self.telemetry = Telemetry(self.timesync, self.counts, options.attitude_rate_hz, options.position_rate_hz)
+        self.release = Release(options)
+        self.latency = LatencyMeter()
+        self.monitor = FusionMonitor()
+        self.source_set = PendingSwitch()
+        self._advice: DelayAdvice | None = None
         self._vehicle: AutopilotIdentity | None = None
         self._heartbeat_ns = 0
         self._silent = False
@@ -66,6 +75,8 @@ class LinkProtocol:
         self._origin_timer = Repeat(1 * _S)
         self._origin_watch_timer = Repeat(5 * _S)
         self._home_timer = Repeat(2 * _S, 10 * _S)
+        self._monitor_timer = Repeat(_S // 2)
+        self._advice_timer = Repeat(60 * _S)
         self._handlers: dict[str, Callable[[MavlinkMessage, int], None]] = {
             "HOME_POSITION": self._on_home,
             "AUTOPILOT_VERSION": self._on_version,
@@ -218,8 +229,13 @@ class LinkProtocol:
         # Printable only: what comes over a radio must not steer a terminal.
         text = "".join(c if c.isprintable() else "?" for c in str(m.text))
         self._log(arrival_ns, level, f"text.{hash(text) % 64}", f"autopilot says: {text}")
+        self.monitor.heard(text)
 
     def _on_command_ack(self, m: MavlinkMessage, arrival_ns: int) -> None:
+        if m.command == dialect.MAV_CMD_SET_EKF_SOURCE_SET and m.result != dialect.MAV_RESULT_IN_PROGRESS:
+            number = self.source_set.answered()
+            if number is not None and m.result != dialect.MAV_RESULT_ACCEPTED:
+                logger.warning("autopilot refuses to take EKF source set %d (result %d)", number, m.result)
         if m.result not in (dialect.MAV_RESULT_ACCEPTED, dialect.MAV_RESULT_IN_PROGRESS):
             self.counts["commands_refused"] += 1
 
@@ -266,7 +282,40 @@ class LinkProtocol:
             for stream in self._streams.values()
             if stream.due(now_ns)
         ]
+        number = self.source_set.due(now_ns)
+        if number is not None:
+            out.append(self._command(dialect.MAV_CMD_SET_EKF_SOURCE_SET, number))
+        if self._monitor_timer.due(now_ns):
+            self.monitor.assess(now_ns, self.state_at, vehicle.autopilot)
+        if self._advice_timer.due(now_ns):
+            self._tell_delays()
         return out
+
+    def sent(self, outgoing: Outgoing, now_ns: int) -> None:
+        """An estimate was handed to the line."""
+        if outgoing.repeat == 0:
+            self.latency.add(now_ns - outgoing.capture_ns)
+        if self._vehicle is not None:
+            self.monitor.sent(outgoing.estimate, now_ns, self.state_at, self._vehicle.autopilot)
+
+    @property
+    def fusion(self) -> FusionReport:
+        return self.monitor.report
+
+    def delay_advice(self) -> DelayAdvice | None:
+        """What the autopilot should be told of our latency; None before a fix was sent."""
+        if self._vehicle is None:
+            return None
+        return advise(
+            self._vehicle.autopilot, self.release.mode, self.latency, self._options.fixed_latency_ms,
+            self.timesync.last_round_trip_ns,
+        )  # fmt: skip
+
+    def _tell_delays(self) -> None:
+        advice = self.delay_advice()
+        if advice is not None and (self._advice is None or advice.differs(self._advice)):
+            self._advice = advice
+            logger.info("measured latency asks for %s", advice)
 
     def encode_estimate(self, estimate: VisionEstimate) -> list[MavlinkMessage]:
         """The messages for an estimate, in the form that the autopilot found reads; none before it was
@@ -323,8 +372,17 @@ class LinkProtocol:
         round_trip = self.timesync.last_round_trip_ns
         vehicle = self._vehicle
         version = vehicle.firmware_version if vehicle else None
+        advice = self.delay_advice()
         return {
             **self.counts,
+            **{f"release.{name}": count for name, count in self.release.counts.items()},
+            "displacement_trusted": self.release.displacement_trusted,
+            "latency_median_ms": self.latency.percentile_ms(50.0),
+            "latency_p99_ms": self.latency.percentile_ms(99.0),
+            "delay_advice": None if advice is None else str(advice),
+            "fusion": self.fusion.state.value,
+            "fusion_since_s": (now_ns - self.fusion.since_ns) / _S if self.fusion.since_ns else None,
+            "fusion_reason": self.fusion.reason,
             "connected": self.connected(now_ns),
             "autopilot": vehicle.autopilot.value if vehicle else None,
             "vehicle_system_id": vehicle.system_id if vehicle else None,
