@@ -5,11 +5,11 @@ GNSS minus fix, over both covariances, summed up over time, shows it. The statis
 squared normalised horizontal difference q, two degrees of freedom, against time rather than count, since errors of both
 are alike from one frame to the next and ten fixes a second know little more than one:
 
-    S <- clip(S + (min(q, most) - reference) dt, 0, ceiling)
+    S <- clip(S + (min(median of the last three q, most) - reference) dt, 0, ceiling)
 
 ``reference`` is what a bias may do for ever: GNSS's least sigma (telemetry: 1.5 m) and the fix's are in q's covariance,
-and with 9 a constant difference of three sigmas, 5 m at best, raises nothing. ``most`` bounds what one wild fix can
-do. docs/studies/witness.md has the times to detection and the false alarms.
+and with 16 a constant difference of four sigmas, 6.3 m at best, raises nothing. The median leaves single wild fixes
+out, and ``most`` bounds what a few can do. docs/studies/witness.md has the times to detection and the false alarms.
 
 Heights are looked at apart: a constant difference that is large is a datum mixed up (the geoid is 30 to 50 m), not
 spoofing, and must not be told as such.
@@ -49,10 +49,10 @@ class WitnessOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         height_m: a constant difference in height beyond this is told.
     """
 
-    reference: Annotated[float, Meta(gt=2)] = 9.0
-    most: Annotated[float, Meta(gt=2)] = 36.0
-    suspect_score: Annotated[float, Meta(gt=0)] = 15.0
-    bad_score: Annotated[float, Meta(gt=0)] = 45.0
+    reference: Annotated[float, Meta(gt=2)] = 16.0
+    most: Annotated[float, Meta(gt=2)] = 64.0
+    suspect_score: Annotated[float, Meta(gt=0)] = 30.0
+    bad_score: Annotated[float, Meta(gt=0)] = 100.0
     clear_s: Annotated[float, Meta(gt=0)] = 20.0
     forget_s: Annotated[float, Meta(gt=0)] = 60.0
     height_m: Annotated[float, Meta(gt=0)] = 15.0
@@ -99,6 +99,7 @@ class Witness:
         self._compared_s = 0.0
         self._clear_s = 0.0
         self._apart_m: float | None = None
+        self._last_squared: deque[float] = deque(maxlen=3)
         self._heights_m: deque[float] = deque(maxlen=_HEIGHTS)
 
     @property
@@ -132,9 +133,9 @@ class Witness:
         self._last_ns = stamp_ns
         self._apart_m = math.hypot(east, north)
         self._heights_m.append(up)
-        squared = (c * east * east - 2.0 * b * east * north + a * north * north) / determinant
+        self._last_squared.append((c * east * east - 2.0 * b * east * north + a * north * north) / determinant)
         options = self._options
-        gain = (min(squared, options.most) - options.reference) * step_s
+        gain = (min(median(self._last_squared), options.most) - options.reference) * step_s
         self._score = min(max(self._score + gain, 0.0), _CEILING * options.bad_score)
         self._compared_s += step_s
         self._clear_s = self._clear_s + step_s if self._score < options.suspect_score / 2.0 else 0.0
@@ -147,6 +148,7 @@ class Witness:
             self._score = self._compared_s = self._clear_s = 0.0
             self._apart_m = None
             self._heights_m.clear()
+            self._last_squared.clear()
             self._enter(Consistency.UNKNOWN, now_ns)
 
     def _judge(self, now_ns: int) -> None:

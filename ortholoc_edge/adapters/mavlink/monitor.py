@@ -43,9 +43,9 @@ _PROBES_NEEDED = 5
 _REFUSED_RATIO, _ACCEPTED_RATIO = 1.0, 0.8
 # Less apart than this, or than two sigmas of a fix, the position is where the fixes are.
 _APART_M, _APART_SIGMAS = 1.0, 2.0
-# Part of the distance to the fixes that a filter goes in `_ANSWER_NS` if it takes them: 0.5 and more with our sigmas,
-# in simulation; drift between fixes takes some of that back.
-_ANSWERS = 0.15
+# Part of the distance to the fixes that a filter goes in `_ANSWER_NS` if it takes them. One that takes none goes as its
+# velocity says, so that what is left is the error of integrating it, centimetres.
+_ANSWERS = 0.08
 # Between fixes (0) and GNSS (1): nearer to which.
 _AT_FIXES, _AT_GNSS = 0.35, 0.65
 _POSITION_FLAG = dialect.ESTIMATOR_POS_HORIZ_ABS  # bit 4 with both
