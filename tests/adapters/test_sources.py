@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 
 from ortholoc_edge.adapters.mavlink.estimates import Autopilot
@@ -63,7 +65,7 @@ def test_a_restarted_autopilot_is_told_again():
 def test_flapping_is_bounded():
     switch = make(switch_sources=True)
     commands = [t for t in range(600) if decide(switch, BAD if t % 2 else OK, t) is not None]
-    assert min(b - a for a, b in zip(commands, commands[1:], strict=False)) >= 15
+    assert min(b - a for a, b in itertools.pairwise(commands)) >= 15
 
 
 def test_two_sets_are_needed():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -95,7 +96,7 @@ def test_between_suspect_and_ok_it_does_not_flutter():
     watch = Watch()
     watch.run(20.0)
     watch.run(600.0, lambda t: (4.5 * 1.58 if t % 20.0 < 10.0 else 0.0, 0.0, 0.0), noise_m=0.3)
-    changes = sum(a is not b for (_, a), (_, b) in zip(watch.states, watch.states[1:], strict=False))
+    changes = sum(a is not b for (_, a), (_, b) in itertools.pairwise(watch.states))
     assert changes <= 4
 
 
