@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -173,6 +174,8 @@ def test_yaw_wrong_by_180_is_noticed_by_the_second_fix():
             # Each once, as it is, with its own stamp.
             assert outgoing.repeat == 0 and outgoing.estimate.stamp_ns == outgoing.capture_ns
             assert outgoing.estimate.position_ned_m == pytest.approx(flight.truth(outgoing.capture_ns / S))
+            # An ArduPilot may take it for now: 10 m/s for 0.3 s.
+            assert outgoing.estimate.covariance[0, 0] >= 0.25 + 3.0**2
     # Right again, it is believed again.
     flight.reported_velocity = flight.velocity
     later = {k + 20 * S: flight.fix(v.stamp_ns + 20 * S) for k, v in fixes.items()}
@@ -241,3 +244,22 @@ def test_never_carried_by_an_attitude_that_is_not_known():
     release.take(flight.fix(S), S + 300 * MS, flight.look)
     outgoing = release.due(S + 300 * MS, flight.look)
     assert outgoing.estimate.stamp_ns == S and release.counts["raw_instead"] == 1
+
+
+@pytest.mark.parametrize(("armed", "landed", "speed_m_s"), [(False, None, 0), (True, True, 0), (True, False, 15)])
+def test_the_first_fix_of_an_autopilot_without_a_position(armed, landed, speed_m_s):
+    """It tells no velocity until it has one, so there is nothing to carry a fix on by."""
+    flight = Flight()
+
+    def look(stamp_ns):
+        return replace(
+            flight.look(stamp_ns), velocity_ned=None, odometry_ned_m=None, local_position_ned_m=None, armed=armed,
+            landed=landed,
+        )  # fmt: skip
+
+    release = make()
+    release.take(flight.fix(S), S + 400 * MS, look)
+    estimate = release.due(S + 400 * MS, look).estimate
+    assert estimate.stamp_ns == S
+    assert estimate.covariance[0, 0] == pytest.approx(0.25 + (0.4 * speed_m_s) ** 2)
+    assert release.due(S + 500 * MS, look) is None

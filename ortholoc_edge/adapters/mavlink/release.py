@@ -19,6 +19,9 @@ is to carry the fix on to the moment it is sent:
   it belongs the error of the displacement, which is multiplied as well: the filter made the velocity it came from, so
   each repeat is correlated with its state.
 - It ends when no new fix came for ``max_repeat_s``, the odometry's epoch or the origin changes.
+- A fix that can't be carried on goes once, as it was at its capture, with that stamp. An ArduPilot that was told of no
+  latency takes it for new, so what the vehicle may have flown since is added to its sigma. Without this an autopilot
+  that has no position yet, and hence tells no velocity, would never get its first.
 
 What this costs: the filter's own gate is wider by the square root of that number, so that it catches less of what our
 gate let through. Floors of the receiver (VISO_POS_M_NSE, EKF2_EVP_NOISE, EKF2_AGPn_NOISE) only ever add.
@@ -44,6 +47,8 @@ _MS, _S = 1_000_000, 1_000_000_000
 # Error of the displacement: the tracker's defaults, for the same odometry.
 _ODOMETRY_RATIO = 0.03
 _ODOMETRY_DRIFT_M_PER_S = 0.2
+# The tracker's, too: where the autopilot tells no velocity, a vehicle in the air may fly as fast.
+_UNKNOWN_SPEED_M_PER_S = 15.0
 # Of the autopilot's attitude relative to a moment before: its gyroscopes' noise, and what it corrects by the compass.
 _ATTITUDE_DRIFT_RAD_PER_S = math.radians(0.3)
 # Two fixes that the displacement between them contradicts, in a row, and it is not used until five agree: a heading
@@ -177,9 +182,8 @@ class Release:
             if fix.released > 0:
                 self.counts["repeats_broken"] += 1
                 return None
-            # As it is, once, with its own stamp: right, if late.
             self.counts["raw_instead"] += 1
-            return _as_it_is(fix)
+            return Outgoing(_late(fix.estimate, now_ns, look(now_ns)), fix.estimate.stamp_ns, 0)
         self.counts["repeated" if fix.released else "carried"] += 1
         fix.released += 1
         return Outgoing(carried, fix.estimate.stamp_ns, fix.released - 1)
@@ -248,6 +252,18 @@ def _noise(step: FloatArray, elapsed_s: float) -> FloatArray:
     """(6, 6): what a displacement adds. Drift grows with time, an error of scale or heading with distance."""
     variance = (_ODOMETRY_RATIO * float(np.linalg.norm(step))) ** 2 + (_ODOMETRY_DRIFT_M_PER_S * elapsed_s) ** 2
     return np.diag([variance] * 3 + [(_ATTITUDE_DRIFT_RAD_PER_S * elapsed_s) ** 2] * 3)
+
+
+def _late(estimate: VisionEstimate, now_ns: int, state: AutopilotState | None) -> VisionEstimate:
+    """A fix as it was at its capture, for a filter that may take it for where the vehicle is now."""
+    if state is None:
+        return estimate
+    if state.velocity_ned is not None:
+        speed_m_s = float(np.linalg.norm(state.velocity_ned))
+    else:
+        speed_m_s = _UNKNOWN_SPEED_M_PER_S if state.armed and not state.landed else 0.0
+    flown_m = speed_m_s * (now_ns - estimate.stamp_ns) / _S
+    return replace(estimate, covariance=estimate.covariance + np.diag([flown_m**2] * 3 + [0.0] * 3))
 
 
 def _as_it_is(taken: _Taken) -> Outgoing:
