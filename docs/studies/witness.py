@@ -143,7 +143,7 @@ def main() -> None:
     for scene in (SCENES[0], SCENES[3]):
         for speed in (0.25, 0.5, 1.0, 2.0):
             found = detection(scene, speed, args.ramps, rng)
-            cells = [f"{np.median(v):.0f}, {np.percentile(v, 95):.0f}, {v.max():.0f}" for v in found.values()]
+            cells = [f"{np.median(v):.0f}, {np.percentile(v, 95, method="nearest"):.0f}, {v.max():.0f}" for v in found.values()]
             apart = f"{speed * float(np.median(found['bad'])):.0f}"
             print(f"| {scene.name} | {speed} | {cells[0]} | {cells[1]} | {apart} | {cells[2]} |", flush=True)
     print("\nmedian, 95 %, longest of the ramps; inf: not within its 60 s")

@@ -370,7 +370,7 @@ def run_flight(options: FlightOptions, under_test: UnderTest | None = None, cloc
     clock = clock or SystemClock()
     path = options.pack or demo_pack_path()
     pack = Pack.open(path)
-    site, route = _site_and_route(pack, options)
+    site, route = site_and_route(pack, options)
     placement = _placement(pack, site, options.spec)
     body_from_camera = options.mount.body_from_camera()
     loop_holder: list[ClosedLoop] = []
@@ -450,7 +450,7 @@ def _fly(
         stop.set()
 
 
-def _site_and_route(pack: Pack, options: FlightOptions) -> tuple[Site, FloatArray]:
+def site_and_route(pack: Pack, options: FlightOptions) -> tuple[Site, FloatArray]:
     with MapStore(pack) as store:
         xy = np.array(options.route_m, dtype=np.float64) + np.array([DEMO_WEST_M, DEMO_SOUTH_M])
         # Trees and roofs lift the mean, not the median.
