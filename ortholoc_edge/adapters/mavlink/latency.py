@@ -12,8 +12,8 @@ from ortholoc_edge.adapters.mavlink.estimates import Autopilot
 
 _MS = 1_000_000
 
-# ArduPilot's range of VISO_DELAY_MS, by which it also sizes its buffer; PX4's of EKF2_EV_DELAY.
-_MAX_VISO_DELAY_MS, _MAX_EV_DELAY_MS = 250, 300
+# ArduPilot's range of VISO_DELAY_MS, by which it also sizes its buffer; PX4's of EKF2_EV_DELAY and EKF2_AGPn_DELAY.
+_MAX_VISO_DELAY_MS, _MAX_EV_DELAY_MS, _MAX_AGP_DELAY_MS = 250, 300, 1000
 # PX4 drops TIMESYNC samples with a longer round trip. Without synchronisation it takes the time of arrival.
 _PX4_MAX_ROUND_TRIP_MS = 10.0
 # A change that is worth a word: beyond what one stalled frame does to the statistics.
@@ -85,7 +85,8 @@ def advise(
       vanishes and VISO_DELAY_MS must hold it: the least latency (its 5th percentile) of "raw", the configured one of
       "fixed-latency", none of "fast-forward", where the transport alone is left, half a round trip.
     - PX4 relates our stamps by TIMESYNC, so EKF2_EV_DELAY is 0 in every mode; unless the round trip is 10 ms or more,
-      which it does not take: then it is the age at arrival. GLOBAL_POSITION_SENSOR says its age itself.
+      which it does not take: then it is the age at arrival. GLOBAL_POSITION_SENSOR is always stamped on arrival, so
+      EKF2_AGPn_DELAY is that age: half a round trip of "fast-forward".
     """
     low, middle, high = (meter.percentile_ms(p) for p in (5.0, 50.0, 99.0))
     if low is None or middle is None or high is None:
@@ -109,15 +110,11 @@ def advise(
             f"the round trip of {2.0 * way_ms:.0f} ms is too long for PX4's time synchronisation (10 ms), so that it "
             "stamps by arrival; a faster line helps"
         )
-    if autopilot is Autopilot.PX4 and mode != "fast-forward":
-        notes.append(
-            f"a firmware that leaves out processing_time needs EKF2_AGPn_DELAY = {round(middle + way_ms)} instead"
-        )
     return DelayAdvice(
         autopilot,
         min(viso_ms, _MAX_VISO_DELAY_MS),
         min(ev_ms, _MAX_EV_DELAY_MS),
-        0,
+        min(round(middle + way_ms), _MAX_AGP_DELAY_MS),
         max(math.ceil((high + way_ms) / 10.0) * 10, ev_ms),
         "; ".join(notes),
     )
