@@ -1,7 +1,8 @@
 """The link to the autopilot: MAVLink 2 over UDP, TCP or a serial line.
 
 Layers, from the wire up: `transport` moves bytes, `codec` turns them into messages, `protocol` knows what to say and
-what was heard without doing I/O or reading a clock, and `link` owns the one thread that does both.
+`telemetry` what was heard of the vehicle, without doing I/O or reading a clock, and `link` owns the one thread that
+does both.
 """
 
 from ortholoc_edge.adapters.mavlink.codec import MavlinkMessage
