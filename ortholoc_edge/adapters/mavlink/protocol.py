@@ -15,6 +15,7 @@ from ortholoc_edge.adapters.mavlink.estimates import (
     encode_odometry,
     encode_vision_position_estimate,
 )
+from ortholoc_edge.adapters.mavlink.gimbal import GimbalSelection
 from ortholoc_edge.adapters.mavlink.log import LimitedLog
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity, AutopilotState
@@ -48,13 +49,15 @@ class LinkProtocol:
     and sends what both return, in order.
     """
 
-    def __init__(self, options: LinkOptions) -> None:
+    def __init__(self, options: LinkOptions, gimbal: GimbalSelection | None = None) -> None:
         self._options = options
         self._log = LimitedLog()
         self.system_status = SystemStatus.BOOT
         self.timesync = TimeSync()
         self.counts: Counter[str] = Counter()
-        self.telemetry = Telemetry(self.timesync, self.counts, options.attitude_rate_hz, options.position_rate_hz)
+        self.telemetry = Telemetry(
+            self.timesync, self.counts, options.attitude_rate_hz, options.position_rate_hz, gimbal
+        )
         self._vehicle: AutopilotIdentity | None = None
         self._heartbeat_ns = 0
         self._silent = False
@@ -105,7 +108,9 @@ class LinkProtocol:
             self._on_heartbeat(message, system, arrival_ns)
             return []
         if self._vehicle is None or (system, component) != (self._vehicle.system_id, _AUTOPILOT_COMPONENT):
-            self.counts["ignored"] += 1
+            ours = self._vehicle is not None and system == self._vehicle.system_id
+            taken = ours and self.telemetry.take_of_component(message, arrival_ns)
+            self.counts[f"received.{name}" if taken else "ignored"] += 1
             return []
         self.counts[f"received.{name}"] += 1
         if name in self._streams:
@@ -266,6 +271,11 @@ class LinkProtocol:
             for stream in self._streams.values()
             if stream.due(now_ns)
         ]
+        if self.telemetry.gimbal is not None:
+            out += [
+                self._command(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_ns / 1e3, component)
+                for component, message_id, interval_ns in self.telemetry.gimbal.requests(now_ns)
+            ]
         return out
 
     def encode_estimate(self, estimate: VisionEstimate) -> list[MavlinkMessage]:
@@ -287,10 +297,12 @@ class LinkProtocol:
     def _request(self, message_id: int) -> MavlinkMessage:
         return self._command(dialect.MAV_CMD_REQUEST_MESSAGE, message_id)
 
-    def _command(self, command: int, param1: float, param2: float = 0.0) -> MavlinkMessage:
+    def _command(
+        self, command: int, param1: float, param2: float = 0.0, component: int = _AUTOPILOT_COMPONENT
+    ) -> MavlinkMessage:
         return dialect.MAVLink_command_long_message(
             target_system=self._vehicle.system_id if self._vehicle else 0,
-            target_component=_AUTOPILOT_COMPONENT,
+            target_component=component,
             command=command,
             confirmation=0,
             param1=float(param1),
