@@ -9,7 +9,9 @@ from __future__ import annotations
 import itertools
 import logging
 import math
+import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +22,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from replay import rendered
 
 from ortholoc_edge.adapters.mavlink import LinkOptions
-from ortholoc_edge.adapters.mavlink.estimates import EarthModel
+from ortholoc_edge.adapters.mavlink.estimates import EarthModel, GeodeticOrigin
 from ortholoc_edge.adapters.mavlink.gimbal import GimbalSelection
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol
 from ortholoc_edge.config import MountOptions
@@ -156,6 +158,7 @@ ATTITUDES = [(0.0, 0.0, 0.0), (130.0, 0.0, 30.0), (250.0, 12.0, -30.0), (-75.0, 
 LOOKS = [(40.0, 90.0, 0.0), (200.0, 60.0, 0.0), (310.0, 35.0, 4.0), (130.0, 45.0, -3.0)]
 
 SITE = Site(rendered.georeference(), np.array([*rendered.pose().translation[:2], 430.0]))
+ORIGIN = GeodeticOrigin(SITE.origin.lat_deg, SITE.origin.lon_deg, SITE.origin.height_amsl_m)
 MOUNT = MountOptions(
     preset="forward", gimbal="auto", lever_arm_m=(0.4, -0.1, 0.15), gimbal_arm_m=(0.05, 0.02, -0.03), roll_deg=90.0
 )
@@ -202,7 +205,7 @@ def test_a_fix_of_the_camera_gives_the_true_pose_of_the_body(
 
     sent = vision_estimate(
         found, found.map_from_camera @ mount.body_from_camera.inverse(), SITE.georeference,
-        _origin(), EarthModel.ARDUPILOT, 0, mount.sigma_rad,
+        ORIGIN, EarthModel.ARDUPILOT, 0, mount.sigma_rad,
     )  # fmt: skip
     assert np.linalg.norm(sent.position_ned_m - SITE.autopilot_from_ned(body_ned)) < 1e-3
     assert degrees_off(sent.ned_from_body, ned_from_body) < 2e-3
@@ -210,10 +213,34 @@ def test_a_fix_of_the_camera_gives_the_true_pose_of_the_body(
     assert np.sqrt(np.diag(sent.covariance)[3:]) == pytest.approx(np.hypot(0.005, [0.01, 0.01, 0.02]))
 
 
-def _origin() -> Any:
-    from ortholoc_edge.adapters.mavlink.estimates import GeodeticOrigin
+def test_the_example_of_the_docs() -> None:
+    text = (Path(__file__).resolve().parents[2] / "docs" / "frames.md").read_text(encoding="utf-8")
+    example = text[text.index("Example: a vehicle heads 130") :]
+    quoted = re.search(r"q = \(([^)]*)\)", example)
+    assert quoted is not None
+    q = [float(v) for v in quoted[1].split(",")]
+    link = Link()
+    body = looking(130.0, 0.0, 30.0)
+    link.fly(0.5, lambda _: body, lambda it: it.hear(status(it.ms, LEVEL, IN_VEHICLE, q=q)))
+    found = link.gimbal()
+    assert found is not None
 
-    return GeodeticOrigin(SITE.origin.lat_deg, SITE.origin.lon_deg, SITE.origin.height_amsl_m)
+    def said(axes: FloatArray) -> list[str]:
+        forward = axes[:, 0]
+        ground = forward / forward[2] * 90.0
+        bearing = math.degrees(math.atan2(forward[1], forward[0]))
+        return [f"{bearing:.1f}", f"{math.degrees(math.asin(forward[2])):.1f}", f"{-ground[0]:.1f}", f"{ground[1]:.1f}"]
+
+    right, wrong = looking(150.0, 60.0), body @ looking(20.0, 60.0)
+    assert degrees_off(found, right) < 0.1  # of the three decimals
+    assert said(right)[2:] == ["45.0", "26.0"]
+    assert "45.0 m south and 26.0 m east" in " ".join(example.split())
+    bearing, down, south, east = said(wrong)
+    assert f"a bearing of {bearing}° and {down}° below the horizon, {south} m south and {east} m east" in " ".join(
+        example.split()
+    )
+    in_body = ", ".join(f"{v:.3f}" for v in (body.T @ right)[:, 0])
+    assert f"({in_body})" in example
 
 
 # -- time ------------------------------------------------------------------------------------------------------
@@ -352,7 +379,10 @@ def test_two_of_a_kind_are_not_guessed_between(
     (line,) = [r.getMessage() for r in caplog.records if "gimbals report" in r.getMessage()]
     assert "gimbal_device" in line
     # One of them ends: what is left is plain again.
-    link.fly(3.0, lambda _: LEVEL, lambda it: it.hear(status(it.ms, HERE, IN_EARTH, gimbal_device_id=first[1]), first[0]))
+    component, device = first
+    link.fly(
+        3.0, lambda _: LEVEL, lambda it: it.hear(status(it.ms, HERE, IN_EARTH, gimbal_device_id=device), component)
+    )
     assert degrees_off(link.gimbal(), HERE) < 1e-3
 
 
