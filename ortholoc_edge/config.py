@@ -64,7 +64,8 @@ class MountOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         gimbal_device: MAVLink's gimbal device id, see `GimbalSelection.device`.
         gimbal_delay_ms: a report tells the attitude of so long before its stamp.
         gimbal_max_age_ms: a frame farther than this from the nearest report has no attitude, and gives no fix.
-        gimbal_sigma_deg: 1-sigma of the gimbal's own tilt and heading.
+        gimbal_sigma_deg: 1-sigma of the gimbal's own tilt and heading, at rest; while it turns more is added for
+            what its reports' times are worth.
         gimbal_arm_m: the camera from the point that the gimbal turns about, in the gimbal's axes: forward along the
             line of sight, right, down.
     """

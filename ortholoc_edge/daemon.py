@@ -341,10 +341,11 @@ class Daemon:
         if known.ned_from_gimbal is None or known.ned_from_body is None:
             return None
         options = self._config.mount
-        tilt_deg, heading_deg = options.gimbal_sigma_deg
+        tilt, heading = (
+            math.hypot(math.radians(sigma_deg), known.gimbal_sigma_rad) for sigma_deg in options.gimbal_sigma_deg
+        )
         return CameraMount(
-            options.body_from_camera_in(known.ned_from_body.T @ known.ned_from_gimbal),
-            (math.radians(tilt_deg), math.radians(heading_deg)),
+            options.body_from_camera_in(known.ned_from_body.T @ known.ned_from_gimbal), (tilt, heading)
         )
 
     def _map_position(self, gnss: GnssPosition) -> FloatArray | None:

@@ -304,6 +304,31 @@ def test_nothing_is_known_far_from_the_reports() -> None:
     assert "gimbal" in refused.detail
 
 
+@pytest.mark.parametrize("component", [1, 154])
+def test_what_it_turned_since_the_last_report_is_not_taken_for_known(component: int) -> None:
+    link = Link()
+
+    def report(it: Link) -> None:
+        it.hear(status(it.ms, looking(*sweeping(it.now)), IN_VEHICLE), component, late_ms=0)
+
+    link.fly(1.0, turning, report)
+    rate = rotation.angle_between(looking(*sweeping(link.now - 50 * MS)), looking(*sweeping(link.now))) / 0.05
+    time_s = 0.010 if component == 1 else 0.025
+    known = link.protocol.state_at(link.now - 70 * MS)
+    assert known is not None and known.gimbal_sigma_rad == pytest.approx(rate * time_s, rel=0.1)
+    for ahead_ms in (20, 100, 180):
+        held = link.protocol.state_at(link.now + ahead_ms * MS)
+        assert held is not None and held.ned_from_gimbal is not None and not held.interpolated
+        assert held.gimbal_sigma_rad == pytest.approx(rate * math.hypot(time_s, ahead_ms / 1000.0), rel=0.1)
+        # The vehicle's heading is carried on without rates here: 25 degrees in a second.
+        off = degrees_off(held.ned_from_gimbal, where(link.now + ahead_ms * MS)) - 25.0 * ahead_ms / 1000.0
+        assert off < 1.2 * math.degrees(held.gimbal_sigma_rad)
+    still = Link()
+    still.fly(1.0, turning, lambda it: it.hear(status(it.ms, HERE, IN_VEHICLE), component))
+    state = still.protocol.state_at(still.now + 100 * MS)
+    assert state is not None and state.gimbal_sigma_rad < 1e-6
+
+
 def test_two_frames_of_yaw_are_not_mixed() -> None:
     """The gimbal goes from following the nose to holding a bearing: between the two there is no rotation to follow."""
     link = Link()

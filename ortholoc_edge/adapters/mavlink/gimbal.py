@@ -16,7 +16,7 @@ from __future__ import annotations
 import logging
 import math
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -41,6 +41,9 @@ _CAPACITY = 500
 _GONE_AFTER_NS = 2 * _S
 # Whoever speaks on the link can invent gimbals, each with a history.
 _MAX_SOURCES = 8
+# How well the time of a report is known, beyond the delay that is configured: by a stamp of the autopilot's, which
+# itself had it from the gimbal a little before; and by arrival, after a forwarding autopilot and a busy line.
+_STAMP_SIGMA_NS, _ARRIVAL_SIGMA_NS = 10 * _MS, 25 * _MS
 # With the nose closer to the vertical than about 10 degrees its heading is noise.
 _LEAST_LEVEL_NOSE = 0.17
 # Failures after which its attitude may be anything; the rest are of motors and limits.
@@ -70,19 +73,27 @@ class GimbalSelection:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GimbalAttitude:
-    """``ned_from_gimbal`` (3, 3), true north, of the gimbal's axes: forward along the line of sight, right, down;
-    and whether it lies between two reports (if not, asking again a little later gives a better one)."""
+    """Where a gimbal looked at a stamp.
+
+    Attributes:
+        ned_from_gimbal: (3, 3), true north, of its axes: forward along the line of sight, right, down.
+        interpolated: whether it lies between two reports; if not, asking again a little later gives a better one.
+        sigma_rad: what it may have turned in the time that the stamp is away from what is known.
+    """
 
     ned_from_gimbal: FloatArray
     interpolated: bool
+    sigma_rad: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Report:
-    """``level_from_gimbal`` (3, 3): into axes that are level, with x to north, or below the nose."""
+    """``level_from_gimbal`` (3, 3): into axes that are level, with x to north, or below the nose; and how fast it
+    turned in those since the report before."""
 
     level_from_gimbal: FloatArray
     from_north: bool
+    rate_rad_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +180,12 @@ class Gimbal:
             del self._sources[min(self._sources, key=lambda known: self._sources[known].arrival_ns)]
         heard = self._sources.setdefault(source, _Heard())
         heard.arrival_ns = arrival_ns
-        if not heard.history.add(arrival_ns if boot_ns is None else boot_ns, arrival_ns, report):
+        time_ns = arrival_ns if boot_ns is None else boot_ns
+        before, _ = heard.history.around(time_ns, by_boot=True)
+        if before is not None and before[0] < time_ns and before[1].from_north is report.from_north:
+            turn_rad = rotation.angle_between(before[1].level_from_gimbal, report.level_from_gimbal)
+            report = replace(report, rate_rad_s=turn_rad / ((time_ns - before[0]) / _S))
+        if not heard.history.add(time_ns, arrival_ns, report):
             self._counts["out_of_order"] += 1
 
     # -- at a stamp --------------------
@@ -213,14 +229,18 @@ class Gimbal:
         if chosen is None:
             return None
         first, second, fraction = chosen
-        turned = first.level_from_gimbal
-        if second is not None:
-            turned = rotation.slerp(turned, second.level_from_gimbal, fraction)
+        turned, rate_rad_s = first.level_from_gimbal, first.rate_rad_s
+        away_s = (_STAMP_SIGMA_NS if source.stamped else _ARRIVAL_SIGMA_NS) / _S
+        if second is None:
+            away_s = math.hypot(away_s, fraction)
+        else:
+            turned, rate_rad_s = rotation.slerp(turned, second.level_from_gimbal, fraction), second.rate_rad_s
         if not first.from_north:
             if ned_from_body is None or math.hypot(*ned_from_body[:2, 0]) < _LEAST_LEVEL_NOSE:
                 return None
             turned = rotation.from_euler(0.0, 0.0, rotation.to_euler(ned_from_body)[2]) @ turned
-        return GimbalAttitude(frozen_floats(turned, (3, 3), "ned_from_gimbal"), second is not None)
+        known = frozen_floats(turned, (3, 3), "ned_from_gimbal")
+        return GimbalAttitude(known, second is not None, rate_rad_s * away_s)
 
 
 def _status(m: MavlinkMessage) -> _Report | str:

@@ -54,6 +54,7 @@ class AutopilotState:
             ratio above 1 means that the filter refuses position measurements.
         ned_from_gimbal: (3, 3) of the gimbal's axes, forward along the line of sight; None where no gimbal was
             asked for, or its attitude at the stamp is not known.
+        gimbal_sigma_rad: 1-sigma of what it may have turned in the time by which its reports miss the stamp.
     """
 
     stamp_ns: int
@@ -73,3 +74,4 @@ class AutopilotState:
     estimator_flags: int | None
     position_test_ratio: float | None
     ned_from_gimbal: FloatArray | None = None
+    gimbal_sigma_rad: float = 0.0

@@ -227,6 +227,7 @@ class Telemetry:
             estimator_flags=self._estimator[0] if self._estimator else None,
             position_test_ratio=self._estimator[1] if self._estimator else None,
             ned_from_gimbal=None if gimbal is None else gimbal.ned_from_gimbal,
+            gimbal_sigma_rad=0.0 if gimbal is None else gimbal.sigma_rad,
         )
 
     # -- in --------------------
