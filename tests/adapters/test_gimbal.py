@@ -390,8 +390,11 @@ def test_the_camera_s_gimbal_is_the_one_configured(
     device: int | None, first: tuple[int, int], second: tuple[int, int]
 ) -> None:
     link = Link(GimbalSelection(device))
+    assert link.protocol.statistics(link.now)["gimbal"] == "none heard"
     link.fly(0.5, lambda _: LEVEL, lambda it: both(it, first, second))
     assert degrees_off(link.gimbal(), HERE) < 1e-3
+    told = f"GIMBAL_DEVICE_ATTITUDE_STATUS of component {first[0]}, device {first[1] or 1}"
+    assert link.protocol.statistics(link.now)["gimbal"] == told
 
 
 @pytest.mark.parametrize(("first", "second"), [((1, 1), (1, 2)), ((154, 0), (171, 0))])
@@ -401,6 +404,7 @@ def test_two_of_a_kind_are_not_guessed_between(
     link = Link()
     link.fly(0.5, lambda _: LEVEL, lambda it: both(it, first, second))
     assert link.gimbal() is None
+    assert str(link.protocol.statistics(link.now)["gimbal"]).count("component") == 2
     (line,) = [r.getMessage() for r in caplog.records if "gimbals report" in r.getMessage()]
     assert "gimbal_device" in line
     # One of them ends: what is left is plain again.
@@ -432,6 +436,7 @@ def test_without_a_gimbal_nothing_is_asked_or_taken() -> None:
     link = Link(None)
     link.fly(4.0, lambda _: LEVEL, lambda it: both(it, (1, 1), (154, 0)))
     assert link.gimbal() is None
+    assert link.protocol.statistics(link.now)["gimbal"] is None
     assert not {285, 265} & {message for _, message, _ in link.asked()}
     assert link.protocol.counts["ignored"] > 0
 

@@ -105,6 +105,10 @@ class _Source:
     device: int
     stamped: bool
 
+    def __str__(self) -> str:
+        kind = GIMBAL_MESSAGES[self.rank // 2]
+        return f"{kind} of component {self.component}, device {self.device}"
+
 
 @dataclass(slots=True, eq=False)
 class _Heard:
@@ -147,8 +151,8 @@ class Gimbal:
         device = self._selection.device
         if device is not None:
             return device if device > _LAST_OF_AUTOPILOT else AUTOPILOT_COMPONENT
-        best = min(self._alive(), key=lambda source: source.rank, default=None)
-        return AUTOPILOT_COMPONENT if best is None else best.component
+        best = self._best()
+        return best[0].component if best else AUTOPILOT_COMPONENT
 
     # -- in --------------------
 
@@ -178,6 +182,8 @@ class Gimbal:
         source = _Source(rank, component, device, boot_ns is not None)
         if source not in self._sources and len(self._sources) >= _MAX_SOURCES:
             del self._sources[min(self._sources, key=lambda known: self._sources[known].arrival_ns)]
+        if source not in self._sources:
+            self._log(arrival_ns, logging.INFO, "heard", f"a gimbal reports: {source}")
         heard = self._sources.setdefault(source, _Heard())
         heard.arrival_ns = arrival_ns
         time_ns = arrival_ns if boot_ns is None else boot_ns
@@ -194,6 +200,14 @@ class Gimbal:
         newest = max((heard.arrival_ns for heard in self._sources.values()), default=0)
         return [source for source, heard in self._sources.items() if newest - heard.arrival_ns <= _GONE_AFTER_NS]
 
+    def _best(self) -> list[_Source]:
+        alive = self._alive()
+        return [source for source in alive if source.rank == min(other.rank for other in alive)]
+
+    def __str__(self) -> str:
+        """Who reports: one, or more that nothing tells apart, or nobody."""
+        return "; ".join(sorted(map(str, self._best()))) or "none heard"
+
     def at(
         self, stamp_ns: int, boot_offset_ns: int | None, ned_from_body: FloatArray | None
     ) -> GimbalAttitude | None:
@@ -203,18 +217,16 @@ class Gimbal:
             boot_offset_ns: the autopilot's clock minus ours; None while not synchronised.
             ned_from_body: (3, 3) of the vehicle at the stamp, for its heading.
         """
-        alive = self._alive()
-        best = [source for source in alive if source.rank == min(other.rank for other in alive)]
+        best = self._best()
         if not best:
             return None
         if len(best) > 1:
-            names = ", ".join(sorted(f"component {s.component} device {s.device}" for s in best))
             self._log(
                 stamp_ns,
                 logging.WARNING,
                 "ambiguous",
-                f"{len(best)} gimbals report ({names}) and nothing tells which one carries the camera; set "
-                '[mount] gimbal = "device" and gimbal_device',
+                f"{len(best)} gimbals report ({'; '.join(sorted(map(str, best)))}) and nothing tells which one "
+                'carries the camera; set [mount] gimbal = "device" and gimbal_device',
             )
             return None
         (source,) = best

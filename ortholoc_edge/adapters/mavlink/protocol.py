@@ -341,6 +341,7 @@ class LinkProtocol:
             "autopilot": vehicle.autopilot.value if vehicle else None,
             "vehicle_system_id": vehicle.system_id if vehicle else None,
             "firmware": ".".join(map(str, version)) if version else None,
+            "gimbal": None if self.telemetry.gimbal is None else str(self.telemetry.gimbal),
             "origin_known": self.telemetry.origin is not None,
             "local_epoch": self.telemetry.local_epoch,
             "synchronised": self.timesync.synchronised,
