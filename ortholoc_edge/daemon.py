@@ -46,7 +46,7 @@ from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.matching.registry import make_method
 from ortholoc_edge.matching.types import STRUCTURAL, AnyMatcher
-from ortholoc_edge.pipeline.frame import Frame, VehicleState
+from ortholoc_edge.pipeline.frame import CameraMount, Frame, VehicleState
 from ortholoc_edge.pipeline.localizer import Localizer
 from ortholoc_edge.pipeline.navigator import Navigator
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
@@ -152,14 +152,15 @@ class Daemon:
                 model_path=None if options.model is None else Path(options.model),
                 model_sha256=options.model_sha256,
             )
-            self._body_from_camera = config.mount.body_from_camera()
             localizer = Localizer(config.intrinsics.camera(), self._store, self._matcher, config.localizer)
             resources.callback(localizer.close)
             # In every life of the program another value, or the autopilot would not notice the restart.
             first_reset_counter = self._clock.now_ns() // _S
-            tracker = Tracker(self._georeference, self._body_from_camera, config.tracker, first_reset_counter)
+            gimbal = config.mount.gimbal_selection()
+            fixed = config.mount.body_from_camera() if gimbal is None else None
+            tracker = Tracker(self._georeference, fixed, config.tracker, first_reset_counter)
             self._navigator = Navigator(localizer, tracker, config.timing.budget_ms)
-            self._link = AutopilotLink(config.link, self._clock)
+            self._link = AutopilotLink(config.link, self._clock, gimbal)
             self._bus = resources.enter_context(closing(Bus(config.bus))) if config.bus.enabled else None
             self._recorder = (
                 resources.enter_context(closing(Recorder(Path(config.log.folder), config.log.max_mb)))
@@ -304,7 +305,7 @@ class Daemon:
                 late = Rejected(frame.stamp_ns, Reason.LATE, "a fix, but too old to send, ms", age_ms, limit_ms)
                 self._publish(frame, replace(late, timings_ms=outcome.timings_ms))
                 return
-            self._send(outcome, known)
+            self._send(outcome, known, state)
         self._publish(frame, outcome)
 
     def _age_ms(self, stamp_ns: int) -> float:
@@ -333,6 +334,18 @@ class Daemon:
             known.odometry_epoch,
             position,
             (0.0, 0.0) if known.gnss is None else (known.gnss.sigma_horizontal_m, known.gnss.sigma_vertical_m),
+            self._gimbal_mount(known),
+        )
+
+    def _gimbal_mount(self, known: AutopilotState) -> CameraMount | None:
+        if known.ned_from_gimbal is None or known.ned_from_body is None:
+            return None
+        options = self._config.mount
+        tilt, heading = (
+            math.hypot(math.radians(sigma_deg), known.gimbal_sigma_rad) for sigma_deg in options.gimbal_sigma_deg
+        )
+        return CameraMount(
+            options.body_from_camera_in(known.ned_from_body.T @ known.ned_from_gimbal), (tilt, heading)
         )
 
     def _map_position(self, gnss: GnssPosition) -> FloatArray | None:
@@ -347,12 +360,13 @@ class Daemon:
             self._counts["gnss_unusable"] += 1
             return None
 
-    def _send(self, fix: Fix, known: AutopilotState | None) -> None:
+    def _send(self, fix: Fix, known: AutopilotState | None, state: VehicleState) -> None:
         vehicle, now = self._link.vehicle, self._link.state_at(fix.stamp_ns)
-        if known is None or now is None or vehicle is None:
+        mount = self._navigator.tracker.mount(state)
+        if known is None or now is None or vehicle is None or mount is None:
             self._counts["no_autopilot"] += 1
             return
-        map_from_body = fix.map_from_camera @ self._body_from_camera.inverse()
+        map_from_body = fix.map_from_camera @ mount.body_from_camera.inverse()
         if now.origin is None:
             self._counts["no_origin"] += 1
             self._origin_missing = True
@@ -372,6 +386,7 @@ class Daemon:
                 now.origin,
                 earth_model(vehicle.autopilot),
                 self._navigator.tracker.reset_counter,
+                mount.sigma_rad,
             )
         )
 
@@ -424,12 +439,14 @@ def vision_estimate(
     origin: GeodeticOrigin,
     model: EarthModel,
     reset_counter: int,
+    mount_sigma_rad: tuple[float, float] = (0.0, 0.0),
 ) -> VisionEstimate:
     """A fix as the autopilot wants it: the body in its local NED, true north.
 
     Args:
         map_from_body: of the fix.
         model: by which the autopilot itself relates its local frame to latitude and longitude.
+        mount_sigma_rad: `CameraMount.sigma_rad`: the fix is of the camera, and the body is seen through the gimbal.
     Raises: MapError if the pack does not say how its heights relate to AMSL.
     """
     place = georeference.geodetic_from_map(map_from_body.translation)
@@ -438,6 +455,7 @@ def vision_estimate(
     ned_from_map = frames.map_from_ned_rotation(georeference.convergence_rad(map_from_body.translation[:2])).T
     lever = map_from_body.translation - fix.map_from_camera.translation
     covariance = cov.rotated(cov.of_moved_point(fix.covariance, lever), ned_from_map)
+    covariance[3:, 3:] += cov.turn(mount_sigma_rad)
     # Common to the whole pack: no match tells of it, so it joins only where the height leaves the pack's datum.
     covariance[2, 2] += (georeference.vertical.amsl_sigma_m or 0.0) ** 2
     return VisionEstimate(

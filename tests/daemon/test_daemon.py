@@ -30,10 +30,11 @@ from replay import rendered
 from ortholoc_edge.adapters import systemd
 from ortholoc_edge.adapters.camera import CameraOptions, EndOfFrames
 from ortholoc_edge.adapters.mavlink import LinkOptions
-from ortholoc_edge.config import Config, Intrinsics, LogOptions, MapOptions, MatcherOptions
+from ortholoc_edge.config import Config, Intrinsics, LogOptions, MapOptions, MatcherOptions, MountOptions
 from ortholoc_edge.daemon import Daemon, LatestSlot
 from ortholoc_edge.errors import MapError, OrtholocError
-from ortholoc_edge.geometry import rotation
+from ortholoc_edge.geometry import frames, rotation
+from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.navigator import TimingOptions
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
@@ -381,6 +382,65 @@ def test_end_of_the_frames_ends_the_daemon(tmp_path: Path) -> None:
     assert [o.reason for o in outcomes if isinstance(o, Rejected)] == [Reason.BAD_ATTITUDE] * len(outcomes)
     assert outcomes
     assert not [t for t in threading.enumerate() if t.name in ("capture", "recorder", "mavlink")]
+
+
+class BankedAutopilot(HoveringAutopilot):
+    """In a bank of 30 degrees under the same place, with a gimbal that holds its camera on a bearing of 55 degrees,
+    20 degrees off the plumb line."""
+
+    ATTITUDE = rendered.attitude(30.0, PITCH, YAW)
+    GIMBAL = rendered.attitude(0.0, -70.0, 55.0)
+
+    def __init__(self, wire: Wire) -> None:
+        super().__init__(wire)
+        self.gimbal = self.report
+
+    def truth_at(self, now_ns: int) -> np.ndarray:
+        return self.ATTITUDE
+
+    def report(self, boot_ms: int) -> Any:
+        q = [float(v) for v in rotation.to_quaternion(rendered.attitude(0.0, -70.0, 55.0 - YAW))]
+        flags = dialect.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME | dialect.GIMBAL_DEVICE_FLAGS_YAW_LOCK
+        return dialect.MAVLink_gimbal_device_attitude_status_message(
+            0, 0, boot_ms, flags, q, math.nan, math.nan, math.nan, 0, math.nan, math.nan, 1
+        )
+
+
+def test_a_camera_in_a_gimbal(tmp_path: Path) -> None:
+    """What is sent is the body's pose, not the camera's; and nothing once the gimbal is silent."""
+    mount = MountOptions(preset="forward", gimbal="auto", lever_arm_m=(1.5, -0.5, 0.8))
+    map_from_ned = frames.map_from_ned_rotation(rendered.georeference().convergence_rad(TRUTH.translation[:2]))
+    camera = Rigid3(
+        map_from_ned @ BankedAutopilot.GIMBAL @ frames.BODY_FROM_FORWARD_CAMERA,
+        TRUTH.translation + map_from_ned @ BankedAutopilot.ATTITUDE @ mount.lever_arm_m,
+    )
+    data = rendered.write_picture(tmp_path / "photo_000.jpg", rendered.picture(camera)).read_bytes()
+    for number in range(1, 100):
+        (tmp_path / f"photo_{number:03d}.jpg").write_bytes(data)
+    autopilot = BankedAutopilot(UdpWire())
+    outcomes: list[Outcome] = []
+    try:
+        daemon = Daemon(
+            config(f"folder:{tmp_path}", f"udpout:127.0.0.1:{autopilot.wire.port}", mount=mount),
+            on_outcome=lambda _, outcome: outcomes.append(outcome),
+        )
+        with running(daemon):
+            wait_for(lambda: len(autopilot.messages("ODOMETRY")) >= 4, "four ODOMETRY")
+            autopilot.gimbal = None
+            wait_for(lambda: getattr(outcomes[-1], "reason", None) is Reason.GIMBAL_UNKNOWN, "a frame without gimbal")
+            sent, frames_so_far = len(autopilot.messages("ODOMETRY")), len(outcomes)
+            wait_for(lambda: len(outcomes) >= frames_so_far + 4, "four more frames")
+            later = outcomes[frames_so_far:]
+            assert {getattr(outcome, "reason", None) for outcome in later} == {Reason.GIMBAL_UNKNOWN}
+            assert len(autopilot.messages("ODOMETRY")) == sent
+    finally:
+        autopilot.close()
+    assert autopilot.intervals_ns[dialect.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS] == 50_000_000
+    for message in autopilot.messages("ODOMETRY"):
+        turn = rotation.from_quaternion(message.q)
+        assert math.degrees(rotation.angle_between(turn, BankedAutopilot.ATTITUDE)) < 1.5
+        # The camera is 1.7 m from the body.
+        assert np.linalg.norm(np.array([message.x, message.y, message.z]) - TRUE_NED) < 1.0
 
 
 class _BrokenMatcher:

@@ -13,6 +13,7 @@ from typing import Any
 
 from ortholoc_edge.adapters.mavlink.codec import FrameParser, MavlinkMessage, dialect
 from ortholoc_edge.adapters.mavlink.estimates import GeodeticOrigin, VisionEstimate
+from ortholoc_edge.adapters.mavlink.gimbal import GimbalSelection
 from ortholoc_edge.adapters.mavlink.log import LimitedLog
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus, parse_endpoint
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol, Statistic
@@ -40,11 +41,15 @@ class AutopilotLink:
     again it ends, and :attr:`failure` says why; the daemon should then end too.
     """
 
-    def __init__(self, options: LinkOptions, clock: Clock) -> None:
-        """Raises: ConfigError if the endpoint can't be understood."""
+    def __init__(self, options: LinkOptions, clock: Clock, gimbal: GimbalSelection | None = None) -> None:
+        """
+        Args:
+            gimbal: the one that carries the camera; None: a fixed mount.
+        Raises: ConfigError if the endpoint can't be understood.
+        """
         self._endpoint = parse_endpoint(options.endpoint)
         self._options, self._clock = options, clock
-        self._protocol = LinkProtocol(options)
+        self._protocol = LinkProtocol(options, gimbal)
         self._mav = dialect.MAVLink(None, 0, options.component_id)
         self._lock = threading.Lock()
         self._stop = threading.Event()
