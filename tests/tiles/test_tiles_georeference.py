@@ -15,14 +15,9 @@ from ortholoc_edge.errors import ConfigError, MapError
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.frames import ecef_from_geodetic, map_from_ned_rotation, ned_from_ecef_rotation
 from ortholoc_edge.geometry.rigid import Rigid3
-from ortholoc_edge.tiles.georeference import (
-    Georeference,
-    HeightOffsets,
-    LocalFrame,
-    VerticalDatum,
-    datum_shift_caveat,
-    derive_offsets,
-)
+from ortholoc_edge.tiles.georeference import Georeference, HeightOffsets, LocalFrame, VerticalDatum
+from ortholoc_edge.tiles.systems import datum_shift_caveat
+from ortholoc_edge.tiles.vertical import derive_offsets
 
 ELLIPSOIDAL = VerticalDatum(kind="ellipsoid", ellipsoid_minus_map_m=0.0, amsl_minus_map_m=-47.5)
 UNKNOWN = VerticalDatum(kind="unknown")
@@ -279,7 +274,7 @@ def test_geoid_grid_is_used_where_proj_has_it(tmp_path):
     import numpy as np, pyproj.datadir, rasterio
     from affine import Affine
     from ortholoc_edge.errors import ConfigError
-    from ortholoc_edge.tiles.georeference import derive_offsets
+    from ortholoc_edge.tiles.vertical import derive_offsets
 
     def derive_vertical(kind, epsg, undulation_m, place):
         return derive_offsets(kind, epsg, undulation_m, [place])[0]
