@@ -33,7 +33,7 @@ from ortholoc_edge.tiles.store import CACHE_BYTES, MapStore
 ANY_BYTES = 2**40
 _MB = 1e6
 # As the systemd unit has them: without, freed memory stays with the process.
-_MALLOC = {"MALLOC_ARENA_MAX": "2", "MALLOC_MMAP_THRESHOLD_": "4000000", "MALLOC_TRIM_THRESHOLD_": "16000000"}
+MALLOC = {"MALLOC_ARENA_MAX": "2", "MALLOC_MMAP_THRESHOLD_": "4000000", "MALLOC_TRIM_THRESHOLD_": "16000000"}
 
 
 def pack_km2(pack: Pack) -> float:
@@ -86,7 +86,7 @@ class LocalizerProcess:
         ask = json.dumps(
             {"pack": str(pack), "flight": str(flight), "matcher": matcher, "features": features, "cache": cache_bytes}
         )
-        environment = {**os.environ, **_MALLOC, "OPENBLAS_NUM_THREADS": "1"}
+        environment = {**os.environ, **MALLOC, "OPENBLAS_NUM_THREADS": "1"}
         self._process = subprocess.Popen(
             [sys.executable, "-c", code, ask], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
         )
