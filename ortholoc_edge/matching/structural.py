@@ -157,10 +157,12 @@ def correlate(
         return Correlation(np.empty((0, 2)), np.empty((side, side, 0), np.float32), origin, np.empty((0, 2, 2)))
     height, width = rows * cell, columns * cell
     fixed = template[:, :height, :width]
-    around = _shifted_window(searched, radius, origin, height, width)
     every = [(dx, dy) for dy in range(side) for dx in range(side)]
+    around = _shifted_window(searched, radius, origin, height, width)
     scores = _patches(_products(fixed, around, every, cell), patch_cells, stride)
     energy = _patches(_energies(around, radius, cell, height, width), patch_cells, stride)
+    # As large as a field: not to be held beside the next.
+    del around
     own = _products(fixed, _shifted_window(template, 1, (0, 0), height, width), _OWN_SHIFTS, cell)
     self_scores = _patches(own, patch_cells, stride)
     fixed_energy = np.maximum(self_scores[0], _MIN_ENERGY)
