@@ -113,7 +113,7 @@ def test_several_threads_get_the_same_positions():
 def test_a_datum_that_nobody_knows_is_refused_by_a_build():
     """GDAL would take it for WGS 84."""
     crs = "+proj=utm +zone=33 +a=6378000 +b=6356000 +units=m +type=crs"
-    with pytest.raises(MapError, match="no way to WGS 84.*EPSG:32633"):
+    with pytest.raises(MapError, match=r"no way to WGS 84.*EPSG:32633"):
         require_way_to_wgs84(crs, (45.0, 15.0))
     require_way_to_wgs84("EPSG:31467", (49.6, 9.0))
 
