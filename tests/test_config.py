@@ -58,8 +58,8 @@ def write(folder: Path, *changes: tuple[str, str]) -> Path:
         ("gimbal_arm_m = [0.0, 0", "gimbal_arm_m = [0.1, 0", r"without a gimbal.*lever_arm_m.*\$\.mount"),
         ("gimbal_delay_ms = 0.0", "gimbal_delay_ms = nan", r"mount\.gimbal_delay_ms"),
         ('send = ["auto"]  ', "send = []  ", r"link\.send"),
-        ('send = ["auto"]  ', 'send = ["auto", "odometry"]  ', r"link.*mixes auto"),
-        ('send = ["auto"]  ', 'send = ["gps_input", "gps_input"]  ', r"link.*twice"),
+        ('send = ["auto"]  ', 'send = ["auto", "odometry"]  ', r"mixes auto.*\$\.link"),
+        ('send = ["auto"]  ', 'send = ["gps_input", "gps_input"]  ', r"twice.*\$\.link"),
         ("sensor_id = 1", "sensor_id = 0", r"link\.sensor_id"),
         ('folder = "/var/log/ortholoc-edge"', 'folder = ""', r"\$\.log\.folder"),
         # One table against another.
