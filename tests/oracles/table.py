@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -226,4 +227,12 @@ def document() -> str:
             if bounds.least_rate_hz or bounds.most_rate_hz < math.inf:
                 most = f"{bounds.most_rate_hz:g} Hz" if bounds.most_rate_hz < math.inf else "–"
                 text += f"| {name} | {sink.value.upper()} | {bounds.least_rate_hz:g} Hz | {most} |\n"
-    return text + NOTES
+    return _with_names_as_code(text + NOTES)
+
+
+def _with_names_as_code(text: str) -> str:
+    """Names of messages and parameters in backticks, where they are not yet."""
+    names = re.compile(r"\b(?:ODOMETRY|TIMESYNC|[A-Z][A-Z0-9n]*(?:_[A-Z0-9n]+)+)\b")
+    parts = text.split("`")
+    parts[::2] = [names.sub(r"`\g<0>`", part) for part in parts[::2]]
+    return "`".join(parts)

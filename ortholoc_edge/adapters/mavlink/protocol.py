@@ -254,7 +254,10 @@ class LinkProtocol:
         ts1 = self.timesync.due(now_ns)
         if ts1 is not None:
             out.append(dialect.MAVLink_timesync_message(tc1=0, ts1=ts1))
-        if vehicle.firmware_version is None and self._version_timer.due(now_ns):
+        if vehicle.firmware_version is not None:
+            # What is doubtful about the choice is told before the first estimate.
+            self._outlet.sinks(vehicle)
+        elif self._version_timer.due(now_ns):
             out.append(self._request(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION))
         if (self._origin_timer if self.telemetry.origin is None else self._origin_watch_timer).due(now_ns):
             out.append(self._request(dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN))
