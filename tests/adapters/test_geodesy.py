@@ -11,7 +11,14 @@ from hypothesis import strategies as st
 from pyproj import Geod
 from strategies import finite
 
-from ortholoc_edge.adapters.mavlink.geodesy import EarthModel, GeodeticOrigin, Place, moved, ned_from_geodetic
+from ortholoc_edge.adapters.mavlink.geodesy import (
+    EarthModel,
+    GeodeticOrigin,
+    Place,
+    geodetic_from_ned,
+    moved,
+    ned_from_geodetic,
+)
 
 GEOD = Geod(ellps="WGS84")
 
@@ -39,6 +46,18 @@ def test_offsets_are_true_metres(latitude, longitude, azimuth, distance_m):
     bent_m = distance_m**2 * math.tan(math.radians(abs(latitude) + 0.2)) / (2 * 6_335_000.0)
     np.testing.assert_allclose(offsets[EarthModel.ARDUPILOT][:2], true_m, atol=0.0071 * distance_m + bent_m + 0.01)
     assert {ned[2] for ned in offsets.values()} == {-150.0}
+
+
+@pytest.mark.parametrize("model", list(EarthModel))
+@given(
+    latitude=finite(-80.0, 80.0),
+    longitude=finite(-180.0, 180.0),
+    position=st.tuples(finite(-20_000.0, 20_000.0), finite(-20_000.0, 20_000.0), finite(-5000.0, 500.0)),
+)
+def test_there_and_back(model, latitude, longitude, position):
+    origin = GeodeticOrigin(latitude, longitude, 250.0)
+    place = geodetic_from_ned(origin, np.array(position), model)
+    np.testing.assert_allclose(ned_from_geodetic(origin, *place, model), position, atol=1e-3)
 
 
 @pytest.mark.parametrize("latitude", [-72.0, -33.9, 0.0, 8.5, 50.7, 69.6, 82.0])

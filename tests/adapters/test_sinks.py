@@ -18,7 +18,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from ortholoc_edge.adapters.mavlink import LinkOptions
 from ortholoc_edge.adapters.mavlink.estimates import Autopilot, VisionEstimate
-from ortholoc_edge.adapters.mavlink.geodesy import EarthModel, GeodeticOrigin, Place
+from ortholoc_edge.adapters.mavlink.geodesy import EarthModel, GeodeticOrigin, Place, ned_from_geodetic
 from ortholoc_edge.adapters.mavlink.log import LimitedLog
 from ortholoc_edge.adapters.mavlink.outlet import Outlet
 from ortholoc_edge.adapters.mavlink.sinks import (
@@ -72,14 +72,15 @@ def estimates(draw: st.DrawFn) -> VisionEstimate:
 
 
 def estimate(sigma_m: float = 2.0, **change) -> VisionEstimate:
+    place = Place(50.7001, 7.1002, 140.25, 187.5)
     made = VisionEstimate(
         1000 * S,
-        np.array([10.0, 20.0, -80.0]),
+        ned_from_geodetic(ORIGIN, 50.7001, 7.1002, 140.25, EarthModel.PX4),
         np.eye(3),
         np.diag([sigma_m**2, sigma_m**2, 16.0, 0.01, 0.01, 0.04]),
         3,
         0.8,
-        Place(50.7001, 7.1002, 140.25, 187.5),
+        place,
         ORIGIN,
     )
     return replace(made, **change)
@@ -148,13 +149,18 @@ def test_global_position_sensor_says_when_it_was_captured():
     assert (m.source, m.flags) == (dialect.GLOBAL_POSITION_SRC_VISION, 0)
     assert (m.time_usec, m.processing_time) == (1_000_180_000, 180_000)
     assert (m.lat, m.lon) == (507001000, 71002000)
-    assert (m.alt, m.alt_ellipsoid, m.eph, m.epv) == (140.25, 187.5, 2.0, 4.0)
+    assert (m.alt, m.alt_ellipsoid, m.eph, m.epv) == pytest.approx((140.25, 187.5, 2.0, 4.0))
+    # Carried on by its local position, a quarter of a kilometre north on PX4's sphere and 10 m up, it goes along.
+    carried = estimate(position_ned_m=said.position_ned_m + np.array([250.0, 0.0, -10.0]))
+    m = over_the_wire(encode(Sink.GLOBAL_POSITION_SENSOR, carried, None, sending))
+    assert m.lat == pytest.approx(507001000 + math.degrees(250.0 / 6371000.0) * 1e7, abs=1.5)
+    assert (m.lon, m.alt, m.alt_ellipsoid) == pytest.approx((71002000, 150.25, 197.5), abs=1.5)
     unknown = estimate(place=Place(50.7001, 7.1002, 140.25))
     assert math.isnan(over_the_wire(encode(Sink.GLOBAL_POSITION_SENSOR, unknown, None, sending)).alt_ellipsoid)
 
 
 def test_gps_input_is_a_receiver_without_velocity_and_knows_the_week():
-    said = estimate()
+    said = estimate(position_ned_m=None)
     m = over_the_wire(encode(Sink.GPS_INPUT, said, None, Sending(ARDUPILOT, said.stamp_ns + 250 * MS, WALL_NS)))
     # 2026-11-30 is a Monday, week 2447 since 1980-01-06; 07:00:00 UTC is 18 s later by GPS, and 0.25 s have passed.
     assert m.time_week == 2447

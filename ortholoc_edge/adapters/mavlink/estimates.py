@@ -33,7 +33,9 @@ class VisionEstimate:
             the nose north and little tilt these are the same, and the filters use the last one only.
         reset_counter: 0..255; another value than before tells the filter to jump to this estimate.
         quality: 0..1.
-        place: the same position on WGS 84, for messages that don't depend on the origin; None: those can't be sent.
+        place: on WGS 84, for messages that don't depend on the origin; None: those can't be sent. Where there are a
+            local position and its origin, too, these count, so that an estimate can be carried on by
+            ``position_ned_m`` alone; of the place then only the geoid's height is used.
         origin: that ``position_ned_m`` counts from; None: whichever the autopilot has.
     Raises: ValueError if a value has the wrong shape, is not finite, or is out of its range; or if there is neither
         a position nor a place.

@@ -115,6 +115,23 @@ def ned_from_geodetic(
     return np.array([north, east, origin.height_amsl_m - height_amsl_m])
 
 
+def geodetic_from_ned(
+    origin: GeodeticOrigin, position_ned_m: FloatArray, model: EarthModel
+) -> tuple[float, float, float]:
+    """(latitude_deg, longitude_deg, height_amsl_m) of a position (3,): the inverse of `ned_from_geodetic`.
+
+    By steps in true metres: each leaves less than 1 % of what was missing, so that 20 km are right to a millimetre
+    after five.
+    """
+    latitude_deg, longitude_deg, height_amsl_m = origin.latitude_deg, origin.longitude_deg, origin.height_amsl_m
+    for _ in range(5):
+        reached = ned_from_geodetic(origin, latitude_deg, longitude_deg, height_amsl_m, model)
+        latitude_deg, longitude_deg, height_amsl_m = moved(
+            latitude_deg, longitude_deg, height_amsl_m, position_ned_m - reached
+        )
+    return latitude_deg, longitude_deg, height_amsl_m
+
+
 def moved(
     latitude_deg: float, longitude_deg: float, height_amsl_m: float, offset_ned_m: FloatArray
 ) -> tuple[float, float, float]:

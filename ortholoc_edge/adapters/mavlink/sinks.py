@@ -32,7 +32,7 @@ from ortholoc_edge.adapters.mavlink.estimates import (
     vertical_sigma_m,
     yaw_sigma_rad,
 )
-from ortholoc_edge.adapters.mavlink.geodesy import EarthModel, GeodeticOrigin, Place
+from ortholoc_edge.adapters.mavlink.geodesy import EarthModel, GeodeticOrigin, Place, geodetic_from_ned
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import FloatArray
@@ -246,7 +246,8 @@ def encode(
         layout = covariance_layout(vehicle.autopilot, vehicle.firmware_version)
         local = encode_odometry if sink is Sink.ODOMETRY else encode_vision_position_estimate
         return local(estimate, layout)
-    if estimate.place is None:
+    place = _place(estimate, vehicle.autopilot)
+    if place is None:
         return Refusal(sink, "no_place", "the estimate has no position on WGS 84")
     refusal = _outside_time(sink, estimate, sending)
     if refusal is not None:
@@ -256,7 +257,19 @@ def encode(
         Sink.GPS_INPUT: encode_gps_input,
         Sink.EXTERNAL_POSITION_ESTIMATE: encode_external_position_estimate,
     }
-    return encoders[sink](estimate, estimate.place, sending)
+    return encoders[sink](estimate, place, sending)
+
+
+def _place(estimate: VisionEstimate, autopilot: Autopilot) -> Place | None:
+    """Where the local position is on WGS 84, by the formula that it was made with; else the place that is stated."""
+    stated, origin, position = estimate.place, estimate.origin, estimate.position_ned_m
+    if stated is None or origin is None or position is None:
+        return stated
+    latitude_deg, longitude_deg, height_amsl_m = geodetic_from_ned(origin, position, earth_model(autopilot))
+    if stated.height_ellipsoid_m is None:
+        return Place(latitude_deg, longitude_deg, height_amsl_m)
+    undulation_m = stated.height_ellipsoid_m - stated.height_amsl_m
+    return Place(latitude_deg, longitude_deg, height_amsl_m, height_amsl_m + undulation_m)
 
 
 def _beyond_bounds(sink: Sink, estimate: VisionEstimate, vehicle: AutopilotIdentity) -> Refusal | None:
