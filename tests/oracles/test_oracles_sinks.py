@@ -238,6 +238,23 @@ def test_other_messages_leave_odometrys_clock_alone(other):
         assert min(mixed) < -90_000
 
 
+def test_a_build_with_pull_request_31738_takes_the_sensor():
+    row = Row(Autopilot.ARDUPILOT, (4, 8, 0), Sink.GLOBAL_POSITION_SENSOR)
+    stream = list(flight(row, row.oracle((4, 8, 0), pr_31738=True)))
+    assert max(abs(error) for error, _ in stream) <= 6.0
+    for _, used in stream:
+        assert (used.sigma_north_m, used.sigma_east_m) == pytest.approx((2.0, 2.0))
+    # Beside ODOMETRY, with the stamp of capture, it is as good: the latency is taken off by processing_time.
+    oracle = row.oracle((4, 8, 0), pr_31738=True)
+    for n in range(20):
+        said = estimate(Autopilot.ARDUPILOT, stamp_ns=(1000 + n) * S)
+        now_ns = said.stamp_ns + 150 * MS
+        for sink in (Sink.ODOMETRY, Sink.GLOBAL_POSITION_SENSOR):
+            message = sent(replace(row, sink=sink), said, now_ns, True)
+            used = oracle.receive(wire(message), now_ns // 1000 + 2000 - BOOT_US)
+        assert abs(used.capture_us - (said.stamp_ns // 1000 - BOOT_US)) <= 6000
+
+
 @pytest.mark.parametrize("uptime_s", [10, 300, 86_400, 30 * 86_400])
 def test_the_commands_coarse_time_is_never_ahead(uptime_s):
     """As a float it is up to 0.25 s coarse after a month; ahead, it would pull the link's offset."""
