@@ -238,7 +238,7 @@ def _not_finite(value: Any, key: str) -> Iterator[str]:
 
 def _contradictions(config: Config) -> Iterator[str]:
     if not config.link.send:
-        yield "`$.link.send` is empty, so no fix would reach the autopilot; name odometry or vision_position_estimate"
+        yield "`$.link.send` is empty, so no fix would reach the autopilot; write [\"auto\"]"
     for side in ("width_px", "height_px"):
         asked, calibrated = getattr(config.camera, side), getattr(config.intrinsics, side)
         if asked is not None and asked != calibrated:

@@ -29,13 +29,9 @@ from ortholoc_edge.adapters.mavlink import (
     Statistic,
     SystemStatus,
 )
-from ortholoc_edge.adapters.mavlink.estimates import (
-    EarthModel,
-    GeodeticOrigin,
-    VisionEstimate,
-    earth_model,
-    ned_from_geodetic,
-)
+from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate
+from ortholoc_edge.adapters.mavlink.geodesy import EarthModel, GeodeticOrigin, Place, ned_from_geodetic
+from ortholoc_edge.adapters.mavlink.sinks import earth_model
 from ortholoc_edge.adapters.recorder import Recorder
 from ortholoc_edge.clock import Clock, SystemClock
 from ortholoc_edge.config import Config
@@ -178,6 +174,7 @@ class Daemon:
         self._origin_missing = False
         self._damage_reported = 0
         self._origin: GeodeticOrigin | None = None
+        self._recovering = False
         self._last_status_ns = 0
 
     @property
@@ -296,8 +293,10 @@ class Daemon:
             self._feed_watchdog()
             return self._age_ms(frame.stamp_ns) < self._config.timing.max_age_ms and not stop.is_set()
 
+        searching = self._navigator.tracker.status is TrackerStatus.SEARCH
         outcome = self._navigator.step(frame, state, proceed)
         if isinstance(outcome, Fix):
+            self._recovering |= searching
             self._last_fix_ns = frame.stamp_ns
             age_ms, limit_ms = self._age_ms(frame.stamp_ns), self._config.timing.max_age_ms
             if age_ms > limit_ms:
@@ -367,28 +366,30 @@ class Daemon:
             self._counts["no_autopilot"] += 1
             return
         map_from_body = fix.map_from_camera @ mount.body_from_camera.inverse()
-        if now.origin is None:
+        local = [sink.local for sink in self._link.sinks]
+        if now.origin is None and any(local):
             self._counts["no_origin"] += 1
             self._origin_missing = True
             self._offer_origin(map_from_body.translation)
-            return
-        if self._origin is not None and now.origin != self._origin:
+            if all(local):
+                return
+        if any(local) and self._origin is not None and now.origin not in (None, self._origin):
             # What was sent before meant other places; without notice the filter would take this for a jump.
             logger.warning("the autopilot's origin moved")
             self._navigator.tracker.announce_jump()
-        self._origin = now.origin
+        self._origin = now.origin or self._origin
         self._counts["sent"] += 1
-        self._link.send_estimate(
-            vision_estimate(
-                fix,
-                map_from_body,
-                self._georeference,
-                now.origin,
-                earth_model(vehicle.autopilot),
-                self._navigator.tracker.reset_counter,
-                mount.sigma_rad,
-            )
+        estimate = vision_estimate(
+            fix,
+            map_from_body,
+            self._georeference,
+            now.origin,
+            earth_model(vehicle.autopilot),
+            self._navigator.tracker.reset_counter,
+            mount.sigma_rad,
         )
+        self._link.send_estimate(estimate, recovery=self._recovering)
+        self._recovering = False
 
     def _offer_origin(self, position_map: FloatArray) -> None:
         place = self._georeference.geodetic_from_map(position_map)
@@ -436,15 +437,16 @@ def vision_estimate(
     fix: Fix,
     map_from_body: Rigid3,
     georeference: Georeference,
-    origin: GeodeticOrigin,
+    origin: GeodeticOrigin | None,
     model: EarthModel,
     reset_counter: int,
     mount_sigma_rad: tuple[float, float] = (0.0, 0.0),
 ) -> VisionEstimate:
-    """A fix as the autopilot wants it: the body in its local NED, true north.
+    """A fix as the autopilot wants it: the body on WGS 84 and in the autopilot's local NED, true north.
 
     Args:
         map_from_body: of the fix.
+        origin: the autopilot's; without one the estimate has no local position.
         model: by which the autopilot itself relates its local frame to latitude and longitude.
         mount_sigma_rad: `CameraMount.sigma_rad`: the fix is of the camera, and the body is seen through the gimbal.
     Raises: MapError if the pack does not say how its heights relate to AMSL.
@@ -458,13 +460,18 @@ def vision_estimate(
     covariance[3:, 3:] += cov.turn(mount_sigma_rad)
     # Common to the whole pack: no match tells of it, so it joins only where the height leaves the pack's datum.
     covariance[2, 2] += (georeference.vertical.amsl_sigma_m or 0.0) ** 2
+    position = None
+    if origin is not None:
+        position = ned_from_geodetic(origin, place.lat_deg, place.lon_deg, place.height_amsl_m, model)
     return VisionEstimate(
         fix.stamp_ns,
-        ned_from_geodetic(origin, place.lat_deg, place.lon_deg, place.height_amsl_m, model),
+        position,
         ned_from_map @ map_from_body.rotation,
         covariance,
         reset_counter,
         min(fix.quality, 1.0),
+        Place(place.lat_deg, place.lon_deg, place.height_amsl_m, place.height_ellipsoid_m),
+        origin,
     )
 
 

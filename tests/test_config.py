@@ -57,7 +57,10 @@ def write(folder: Path, *changes: tuple[str, str]) -> Path:
         ("# gimbal_device = 154", "gimbal_device = 154", r"gimbal_device = 154.*\$\.mount"),
         ("gimbal_arm_m = [0.0, 0", "gimbal_arm_m = [0.1, 0", r"without a gimbal.*lever_arm_m.*\$\.mount"),
         ("gimbal_delay_ms = 0.0", "gimbal_delay_ms = nan", r"mount\.gimbal_delay_ms"),
-        ('send = ["odometry"]', "send = []", r"link\.send"),
+        ('send = ["auto"]  ', "send = []  ", r"link\.send"),
+        ('send = ["auto"]  ', 'send = ["auto", "odometry"]  ', r"mixes auto.*\$\.link"),
+        ('send = ["auto"]  ', 'send = ["gps_input", "gps_input"]  ', r"twice.*\$\.link"),
+        ("sensor_id = 1", "sensor_id = 0", r"link\.sensor_id"),
         ('folder = "/var/log/ortholoc-edge"', 'folder = ""', r"\$\.log\.folder"),
         # One table against another.
         ("# width_px = 1280", "width_px = 640", r"camera\.width_px.* 640.*intrinsics\.width_px.* 1280"),

@@ -216,6 +216,9 @@ class FakeAutopilot:
         if kind in (
             "ODOMETRY",
             "VISION_POSITION_ESTIMATE",
+            "GLOBAL_POSITION_SENSOR",
+            "GPS_INPUT",
+            "COMMAND_INT",
             "STATUSTEXT",
             "HEARTBEAT",
             "SET_GPS_GLOBAL_ORIGIN",

@@ -22,7 +22,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from replay import rendered
 
 from ortholoc_edge.adapters.mavlink import LinkOptions
-from ortholoc_edge.adapters.mavlink.estimates import EarthModel, GeodeticOrigin
+from ortholoc_edge.adapters.mavlink.geodesy import EarthModel, GeodeticOrigin
 from ortholoc_edge.adapters.mavlink.gimbal import GimbalSelection
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol
 from ortholoc_edge.config import MountOptions

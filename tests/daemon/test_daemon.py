@@ -336,6 +336,66 @@ def test_a_moved_origin_raises_the_reset_counter(folder: Path) -> None:
     assert after.reset_counter == (before.reset_counter + 1) % 256
 
 
+def automatic(folder: Path, wire: UdpWire, **link: Any) -> Config:
+    base = config(f"folder:{folder}", f"udpout:127.0.0.1:{wire.port}")
+    return msgspec.structs.replace(base, link=msgspec.structs.replace(base.link, send=("auto",), **link))
+
+
+def test_a_place_needs_no_origin_and_does_not_jump_with_it(folder: Path) -> None:
+    """PX4 1.18 takes WGS 84: nothing waits for an origin, and one that moves is no news."""
+    wire = UdpWire()
+    autopilot = HoveringAutopilot(wire, with_origin=False)
+    autopilot.autopilot, autopilot.version = dialect.MAV_AUTOPILOT_PX4, (1, 18, 0)
+    daemon = Daemon(automatic(folder, wire, sensor_id=9))
+
+    def sensor() -> list[Any]:
+        return autopilot.messages("GLOBAL_POSITION_SENSOR")
+
+    def told_latitude() -> int | None:
+        state = daemon.link.state_at(0)
+        return None if state is None or state.origin is None else round(state.origin.latitude_deg * 1e7)
+
+    try:
+        with running(daemon):
+            wait_for(lambda: len(sensor()) >= 2, "two GLOBAL_POSITION_SENSOR")
+            counter = daemon._navigator.tracker.reset_counter
+            for latitude in (507000000, 508000000):
+                autopilot.origin = (latitude, 71000000, 60000)
+                wait_for(lambda latitude=latitude: told_latitude() == latitude or None, "the origin")
+                seen = len(sensor())
+                wait_for(lambda seen=seen: len(sensor()) >= seen + 2, "two more")
+            assert daemon._navigator.tracker.reset_counter == counter
+    finally:
+        autopilot.close()
+    for message in sensor():
+        # 1e-5 degrees are a metre.
+        assert message.lat == pytest.approx(PLACE.lat_deg * 1e7, abs=300)
+        assert message.lon == pytest.approx(PLACE.lon_deg * 1e7, abs=500)
+        assert message.alt == pytest.approx(PLACE.height_amsl_m, abs=3.0)
+        assert message.id == 9
+        assert 0 < message.processing_time < 20_000_000
+        assert message.time_usec >= message.processing_time
+    assert not any("origin" in m.text for m in autopilot.messages("STATUSTEXT"))
+    # The version may not have been told before the first estimates; with no origin they were not sent.
+    assert autopilot.messages("ODOMETRY") == []
+
+
+def test_recovery_is_told_once(folder: Path) -> None:
+    wire = UdpWire()
+    autopilot = HoveringAutopilot(wire)
+    daemon = Daemon(automatic(folder, wire, recovery=True))
+    try:
+        with running(daemon):
+            wait_for(lambda: len(autopilot.messages("ODOMETRY")) >= 4, "four ODOMETRY")
+    finally:
+        autopilot.close()
+    (command,) = autopilot.messages("COMMAND_INT")
+    assert command.command == dialect.MAV_CMD_EXTERNAL_POSITION_ESTIMATE
+    assert command.x == pytest.approx(PLACE.lat_deg * 1e7, abs=300)
+    kinds = [m.get_type() for m in autopilot.got if m.get_type() in ("COMMAND_INT", "ODOMETRY")]
+    assert kinds[:2] == ["COMMAND_INT", "ODOMETRY"]
+
+
 def test_watchdog_starves_when_the_camera_hangs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
     monkeypatch.setattr(systemd, "notify", said.append)

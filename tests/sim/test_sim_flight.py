@@ -63,7 +63,7 @@ def flown(site: Site, seconds: float, *, estimates: bool, seed: int = 1, noise_m
         if estimates and tick % 25 == 0 and truth is not None:
             position = site.autopilot_from_ned(truth.position_ned_m) + rng.normal(0.0, noise_m, 3)
             replies += protocol.encode_estimate(
-                VisionEstimate(taken, position, truth.ned_from_body, np.diag([noise_m**2] * 3 + [1e-4] * 3))
+                VisionEstimate(taken, position, truth.ned_from_body, np.diag([noise_m**2] * 3 + [1e-4] * 3)), now
             )
         for reply in replies:
             for answer in loop.receive(from_us.feed(reply.pack(ours), now), now):

@@ -12,14 +12,16 @@ from types import TracebackType
 from typing import Any
 
 from ortholoc_edge.adapters.mavlink.codec import FrameParser, MavlinkMessage, dialect
-from ortholoc_edge.adapters.mavlink.estimates import GeodeticOrigin, VisionEstimate
+from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate
+from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin
 from ortholoc_edge.adapters.mavlink.gimbal import GimbalSelection
 from ortholoc_edge.adapters.mavlink.log import LimitedLog
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus, parse_endpoint
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol, Statistic
+from ortholoc_edge.adapters.mavlink.sinks import Sink
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity, AutopilotState
 from ortholoc_edge.adapters.mavlink.transport import Transport, open_transport
-from ortholoc_edge.clock import Clock
+from ortholoc_edge.clock import Clock, wall_clock_ns
 from ortholoc_edge.errors import LinkError
 
 logger = logging.getLogger(__name__)
@@ -31,6 +33,7 @@ _TCP_SILENCE_NS = 10 * _S
 _BACKOFF_MIN_S, _BACKOFF_MAX_S = 0.5, 10.0
 _SELECT_TIMEOUT_S = 0.05
 _GIVE_UP_AFTER_ERRORS = 10
+_CARRY_ESTIMATES = {sink.value.upper() for sink in Sink}
 
 
 class AutopilotLink:
@@ -57,6 +60,7 @@ class AutopilotLink:
         self._transport: Transport | None = None
         self._wake_pair: tuple[socket.socket, socket.socket] | None = None
         self._estimate: VisionEstimate | None = None
+        self._recovery = False
         self._texts: deque[MavlinkMessage] = deque(maxlen=16)
         self._text_id = 0
         self._log = LimitedLog()
@@ -140,12 +144,24 @@ class AutopilotLink:
         with self._lock:
             return self._protocol.state_at(stamp_ns)
 
-    def send_estimate(self, estimate: VisionEstimate) -> None:
-        """Hand an estimate over. One that was not sent yet is replaced and counted: newer is better."""
+    @property
+    def sinks(self) -> tuple[Sink, ...]:
+        """The messages that carry estimates to the autopilot found; empty before it was found."""
+        with self._lock:
+            return self._protocol.sinks
+
+    def send_estimate(self, estimate: VisionEstimate, recovery: bool = False) -> None:
+        """Hand an estimate over. One that was not sent yet is replaced and counted: newer is better.
+
+        Args:
+            recovery: the first one after an outage; told as such with the next that is sent, if
+                ``options.recovery`` allows it.
+        """
         with self._lock:
             if self._estimate is not None:
                 self._counts["estimates_dropped"] += 1
             self._estimate = estimate
+            self._recovery |= recovery
         self._wake()
 
     def send_status_text(self, severity: Severity, text: str) -> None:
@@ -329,8 +345,13 @@ class AutopilotLink:
             # While bytes wait, an estimate stays in its slot, where a newer one can still replace it.
             if self._estimate is not None and not transport.pending():
                 estimate, self._estimate = self._estimate, None
-                encoded = self._protocol.encode_estimate(estimate) if self._protocol.connected(now_ns) else []
-                if not encoded:
+                encoded = []
+                if self._protocol.connected(now_ns):
+                    wall_ns = wall_clock_ns()
+                    encoded = self._protocol.encode_estimate(estimate, now_ns, wall_ns, self._recovery)
+                if encoded:
+                    self._recovery = False
+                else:
                     self._counts["estimates_dropped"] += 1
                 messages = encoded + messages
             while self._texts:
@@ -346,5 +367,5 @@ class AutopilotLink:
             self._counts[f"sent.{message.get_type()}"] += 1
         else:
             self._counts["unsent"] += 1
-            if message.get_type() in ("ODOMETRY", "VISION_POSITION_ESTIMATE"):
+            if message.get_type() in _CARRY_ESTIMATES:
                 self._counts["estimates_dropped"] += 1

@@ -7,17 +7,13 @@ from collections import Counter
 from collections.abc import Callable
 
 from ortholoc_edge.adapters.mavlink.codec import MavlinkMessage, dialect
-from ortholoc_edge.adapters.mavlink.estimates import (
-    Autopilot,
-    GeodeticOrigin,
-    VisionEstimate,
-    covariance_layout,
-    encode_odometry,
-    encode_vision_position_estimate,
-)
+from ortholoc_edge.adapters.mavlink.estimates import Autopilot, VisionEstimate
+from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin
 from ortholoc_edge.adapters.mavlink.gimbal import GimbalSelection
 from ortholoc_edge.adapters.mavlink.log import LimitedLog
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus
+from ortholoc_edge.adapters.mavlink.outlet import Outlet
+from ortholoc_edge.adapters.mavlink.sinks import Sink
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity, AutopilotState
 from ortholoc_edge.adapters.mavlink.streams import Repeat, Stream
 from ortholoc_edge.adapters.mavlink.telemetry import Telemetry
@@ -69,6 +65,7 @@ class LinkProtocol:
         self._origin_timer = Repeat(1 * _S)
         self._origin_watch_timer = Repeat(5 * _S)
         self._home_timer = Repeat(2 * _S, 10 * _S)
+        self._outlet = Outlet(options, self.counts, self._log)
         self._handlers: dict[str, Callable[[MavlinkMessage, int], None]] = {
             "HOME_POSITION": self._on_home,
             "AUTOPILOT_VERSION": self._on_version,
@@ -257,7 +254,10 @@ class LinkProtocol:
         ts1 = self.timesync.due(now_ns)
         if ts1 is not None:
             out.append(dialect.MAVLink_timesync_message(tc1=0, ts1=ts1))
-        if vehicle.firmware_version is None and self._version_timer.due(now_ns):
+        if vehicle.firmware_version is not None:
+            # What is doubtful about the choice is told before the first estimate.
+            self._outlet.sinks(vehicle)
+        elif self._version_timer.due(now_ns):
             out.append(self._request(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION))
         if (self._origin_timer if self.telemetry.origin is None else self._origin_watch_timer).due(now_ns):
             out.append(self._request(dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN))
@@ -278,17 +278,21 @@ class LinkProtocol:
             ]
         return out
 
-    def encode_estimate(self, estimate: VisionEstimate) -> list[MavlinkMessage]:
-        """The messages for an estimate, in the form that the autopilot found reads; none before it was
-        found."""
+    @property
+    def sinks(self) -> tuple[Sink, ...]:
+        """What carries estimates to the autopilot found; empty before it was found."""
+        return () if self._vehicle is None else self._outlet.sinks(self._vehicle)
+
+    def encode_estimate(
+        self, estimate: VisionEstimate, now_ns: int, wall_ns: int = 0, recovery: bool = False
+    ) -> list[MavlinkMessage]:
+        """The messages for an estimate, in the form that the autopilot found reads; none before it was found.
+
+        See :meth:`Outlet.encode`.
+        """
         if self._vehicle is None:
             return []
-        layout = covariance_layout(self._vehicle.autopilot, self._vehicle.firmware_version)
-        encoders = {
-            "vision_position_estimate": encode_vision_position_estimate,
-            "odometry": encode_odometry,
-        }
-        return [encoders[name](estimate, layout) for name in self._options.send]
+        return self._outlet.encode(estimate, self._vehicle, self.telemetry.origin, now_ns, wall_ns, recovery)
 
     def offer_origin(self, origin: GeodeticOrigin) -> None:
         """See :meth:`AutopilotLink.offer_origin`."""

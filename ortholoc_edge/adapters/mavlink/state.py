@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ortholoc_edge.adapters.mavlink.estimates import Autopilot, GeodeticOrigin
+from ortholoc_edge.adapters.mavlink.estimates import Autopilot
+from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin
 from ortholoc_edge.geometry.arrays import FloatArray
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ortholoc_edge.adapters.mavlink.codec import MavlinkMessage, dialect
-from ortholoc_edge.adapters.mavlink.estimates import GeodeticOrigin, moved
+from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin, moved
 from ortholoc_edge.adapters.mavlink.gimbal import GIMBAL_MESSAGES, Gimbal, GimbalSelection
 from ortholoc_edge.adapters.mavlink.history import TimeHistory, choose
 from ortholoc_edge.adapters.mavlink.log import LimitedLog
