@@ -22,6 +22,12 @@ class SystemClock:
         return time.monotonic_ns()
 
 
+def wall_clock_ns() -> int:
+    """Nanoseconds since 1970, as the system believes. Steps, and is wrong where it was never set: for messages that
+    must bear a date, never for stamps."""
+    return time.time_ns()
+
+
 class ManualClock:
     """A clock that the owner sets: recorded stamps in replay, scripted time in tests."""
 

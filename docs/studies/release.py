@@ -57,7 +57,7 @@ def fly(mode: str, latency_s: float, jitter_s: float, viso_ms: float, seconds: f
             protocol.release.take(ready.pop(0)[1], now, protocol.state_at)
         outgoing = protocol.release.due(now, protocol.state_at)
         if outgoing is not None:
-            replies += protocol.encode_estimate(outgoing.estimate)
+            replies += protocol.encode_estimate(outgoing.estimate, now)
             protocol.sent(outgoing, now)
         for reply in replies:
             for answer in loop.receive(to_it.feed(reply.pack(ours), now), now):

@@ -182,16 +182,14 @@ def multiply(
     rows, columns = template.shape[1] // cell, template.shape[2] // cell
     height, width = rows * cell, columns * cell
     fixed = template[:, :height, :width]
-    around = _shifted_window(searched, radius, origin, height, width)
     every = [(dx, dy) for dy in range(2 * radius + 1) for dx in range(2 * radius + 1)]
-    return Products(
-        _products(fixed, around, every, cell),
-        _energies(around, radius, cell, height, width),
-        _products(fixed, _shifted_window(template, 1, (0, 0), height, width), _OWN_SHIFTS, cell),
-        cell,
-        radius,
-        origin,
-    )
+    around = _shifted_window(searched, radius, origin, height, width)
+    volume = _products(fixed, around, every, cell)
+    energy = _energies(around, radius, cell, height, width)
+    # As large as a field: not to be held beside the next.
+    del around
+    own = _products(fixed, _shifted_window(template, 1, (0, 0), height, width), _OWN_SHIFTS, cell)
+    return Products(volume, energy, own, cell, radius, origin)
 
 
 def _products(

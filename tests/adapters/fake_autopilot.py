@@ -16,6 +16,7 @@ import threading
 import time
 import tty
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -153,6 +154,8 @@ class FakeAutopilot:
         self.yaw_rate = 0.4
         self.origin: tuple[int, int, int] | None = (507000000, 71000000, 60000)
         self.position_step = 0.0
+        # Makes GIMBAL_DEVICE_ATTITUDE_STATUS of a boot time in ms; None: there is no gimbal.
+        self.gimbal: Callable[[int], Any] | None = None
         self.timesync_answers: list[int] = []
         self._asked_ts1 = 0
         self._stop = threading.Event()
@@ -213,6 +216,9 @@ class FakeAutopilot:
         if kind in (
             "ODOMETRY",
             "VISION_POSITION_ESTIMATE",
+            "GLOBAL_POSITION_SENSOR",
+            "GPS_INPUT",
+            "COMMAND_INT",
             "STATUSTEXT",
             "HEARTBEAT",
             "SET_GPS_GLOBAL_ORIGIN",
@@ -261,6 +267,8 @@ class FakeAutopilot:
         if self.origin is not None:
             origin = self.origin
             makers[d.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN] = lambda ms: d.MAVLink_gps_global_origin_message(*origin)
+        if self.gimbal is not None:
+            makers[d.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS] = self.gimbal
         make = makers.get(message_id)
         return make(boot_ms) if make else None
 

@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ortholoc_edge.adapters.mavlink.estimates import GeodeticOrigin, VisionEstimate
+from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate
+from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin
 from ortholoc_edge.adapters.mavlink.state import AutopilotState, GnssPosition
 from ortholoc_edge.geometry import rotation
 

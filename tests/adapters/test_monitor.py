@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ortholoc_edge.adapters.mavlink.estimates import Autopilot, earth_model, moved, ned_from_geodetic
+from ortholoc_edge.adapters.mavlink.estimates import Autopilot
+from ortholoc_edge.adapters.mavlink.geodesy import moved, ned_from_geodetic
 from ortholoc_edge.adapters.mavlink.monitor import Fusion, FusionMonitor
+from ortholoc_edge.adapters.mavlink.sinks import earth_model
 from ortholoc_edge.adapters.mavlink.state import GnssPosition
 
 from .link_scenes import GOOD_FLAGS, MS, ORIGIN, Flight, S

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ortholoc_edge.adapters.mavlink.geodesy import Place
 from ortholoc_edge.adapters.mavlink.options import LinkOptions
 from ortholoc_edge.adapters.mavlink.release import Outgoing, Release, shares
 from ortholoc_edge.geometry import rotation
@@ -263,3 +264,20 @@ def test_the_first_fix_of_an_autopilot_without_a_position(armed, landed, speed_m
     assert estimate.stamp_ns == S
     assert estimate.covariance[0, 0] == pytest.approx(0.25 + (0.4 * speed_m_s) ** 2)
     assert release.due(S + 500 * MS, look) is None
+
+
+def test_a_place_is_carried_on_as_a_local_position_is():
+    """An autopilot without an origin is told of places on WGS 84 only; with one, both are told."""
+    flight = Flight()
+    flight.origin = None
+    local = flight.fix(S)
+    start = Place(50.0, 7.0, 100.0, 147.0)
+    for fix in (replace(local, position_ned_m=None, place=start), replace(local, place=start)):
+        release = make()
+        release.take(fix, S + 500 * MS, flight.look)
+        estimate = release.due(S + 500 * MS, flight.look).estimate
+        assert estimate.stamp_ns == S + 500 * MS
+        # Five metres north, of which a degree has 111.2 km.
+        assert (estimate.place.latitude_deg - 50.0) * 111_229.0 == pytest.approx(5.0, abs=0.01)
+        assert (estimate.place.longitude_deg, estimate.place.height_ellipsoid_m) == pytest.approx((7.0, 147.0))
+        assert (estimate.position_ned_m is None) == (fix.position_ned_m is None)

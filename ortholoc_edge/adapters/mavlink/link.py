@@ -12,15 +12,18 @@ from types import TracebackType
 from typing import Any
 
 from ortholoc_edge.adapters.mavlink.codec import FrameParser, MavlinkMessage, dialect
-from ortholoc_edge.adapters.mavlink.estimates import GeodeticOrigin, VisionEstimate
+from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate
+from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin
+from ortholoc_edge.adapters.mavlink.gimbal import GimbalSelection
 from ortholoc_edge.adapters.mavlink.latency import DelayAdvice
 from ortholoc_edge.adapters.mavlink.log import LimitedLog
 from ortholoc_edge.adapters.mavlink.monitor import FusionReport
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus, parse_endpoint
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol, Statistic
+from ortholoc_edge.adapters.mavlink.sinks import Sink
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity, AutopilotState
 from ortholoc_edge.adapters.mavlink.transport import Transport, open_transport
-from ortholoc_edge.clock import Clock
+from ortholoc_edge.clock import Clock, wall_clock_ns
 from ortholoc_edge.errors import LinkError
 
 logger = logging.getLogger(__name__)
@@ -32,6 +35,7 @@ _TCP_SILENCE_NS = 10 * _S
 _BACKOFF_MIN_S, _BACKOFF_MAX_S = 0.5, 10.0
 _SELECT_TIMEOUT_S = 0.05
 _GIVE_UP_AFTER_ERRORS = 10
+_CARRY_ESTIMATES = {sink.value.upper() for sink in Sink}
 
 
 class AutopilotLink:
@@ -42,17 +46,22 @@ class AutopilotLink:
     again it ends, and :attr:`failure` says why; the daemon should then end too.
     """
 
-    def __init__(self, options: LinkOptions, clock: Clock) -> None:
-        """Raises: ConfigError if the endpoint can't be understood."""
+    def __init__(self, options: LinkOptions, clock: Clock, gimbal: GimbalSelection | None = None) -> None:
+        """
+        Args:
+            gimbal: the one that carries the camera; None: a fixed mount.
+        Raises: ConfigError if the endpoint can't be understood.
+        """
         self._endpoint = parse_endpoint(options.endpoint)
         self._options, self._clock = options, clock
-        self._protocol = LinkProtocol(options)
+        self._protocol = LinkProtocol(options, gimbal)
         self._mav = dialect.MAVLink(None, 0, options.component_id)
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self._transport: Transport | None = None
         self._wake_pair: tuple[socket.socket, socket.socket] | None = None
+        self._recovery = False
         self._texts: deque[MavlinkMessage] = deque(maxlen=16)
         self._text_id = 0
         self._log = LimitedLog()
@@ -136,13 +145,25 @@ class AutopilotLink:
         with self._lock:
             return self._protocol.state_at(stamp_ns)
 
-    def send_estimate(self, estimate: VisionEstimate) -> None:
+    @property
+    def sinks(self) -> tuple[Sink, ...]:
+        """The messages that carry estimates to the autopilot found; empty before it was found."""
+        with self._lock:
+            return self._protocol.sinks
+
+    def send_estimate(self, estimate: VisionEstimate, recovery: bool = False) -> None:
         """Hand a fix over; when and how often it goes out is ``options.release``'s. One that was not sent yet is
-        replaced and counted: newer is better."""
+        replaced and counted: newer is better.
+
+        Args:
+            recovery: the first one after an outage; told as such with the next that is sent, if
+                ``options.recovery`` allows it.
+        """
         with self._lock:
             self._counts["estimates_dropped"] += self._protocol.release.take(
                 estimate, self._clock.now_ns(), self._protocol.state_at
             )
+            self._recovery |= recovery
         self._wake()
 
     @property
@@ -368,9 +389,12 @@ class AutopilotLink:
             look = self._protocol.state_at
             outgoing = None if transport.pending() else self._protocol.release.due(now_ns, look)
             if outgoing is not None:
-                estimate = outgoing.estimate
-                encoded = self._protocol.encode_estimate(estimate) if self._protocol.connected(now_ns) else []
+                encoded = []
+                if self._protocol.connected(now_ns):
+                    wall_ns = wall_clock_ns()
+                    encoded = self._protocol.encode_estimate(outgoing.estimate, now_ns, wall_ns, self._recovery)
                 if encoded:
+                    self._recovery = False
                     self._protocol.sent(outgoing, now_ns)
                 else:
                     self._counts["estimates_dropped"] += 1
@@ -388,5 +412,5 @@ class AutopilotLink:
             self._counts[f"sent.{message.get_type()}"] += 1
         else:
             self._counts["unsent"] += 1
-            if message.get_type() in ("ODOMETRY", "VISION_POSITION_ESTIMATE"):
+            if message.get_type() in _CARRY_ESTIMATES:
                 self._counts["estimates_dropped"] += 1

@@ -17,13 +17,9 @@ from enum import StrEnum
 import numpy as np
 
 from ortholoc_edge.adapters.mavlink.codec import dialect
-from ortholoc_edge.adapters.mavlink.estimates import (
-    Autopilot,
-    VisionEstimate,
-    earth_model,
-    horizontal_sigma_m,
-    ned_from_geodetic,
-)
+from ortholoc_edge.adapters.mavlink.estimates import Autopilot, VisionEstimate, horizontal_sigma_m
+from ortholoc_edge.adapters.mavlink.geodesy import ned_from_geodetic
+from ortholoc_edge.adapters.mavlink.sinks import earth_model
 from ortholoc_edge.adapters.mavlink.state import AutopilotState
 from ortholoc_edge.geometry.arrays import FloatArray
 
@@ -113,7 +109,7 @@ class FusionMonitor:
         if self._probes and now_ns - self._probes[-1].sent_ns < _PROBE_EVERY_NS:
             return
         state = look(estimate.stamp_ns)
-        if state is None or state.local_position_ned_m is None:
+        if state is None or state.local_position_ned_m is None or estimate.position_ned_m is None:
             return
         gnss = None
         if state.gnss is not None and state.origin is not None:

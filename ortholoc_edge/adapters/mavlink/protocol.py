@@ -7,19 +7,16 @@ from collections import Counter
 from collections.abc import Callable
 
 from ortholoc_edge.adapters.mavlink.codec import MavlinkMessage, dialect
-from ortholoc_edge.adapters.mavlink.estimates import (
-    Autopilot,
-    GeodeticOrigin,
-    VisionEstimate,
-    covariance_layout,
-    encode_odometry,
-    encode_vision_position_estimate,
-)
+from ortholoc_edge.adapters.mavlink.estimates import Autopilot, VisionEstimate
+from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin
+from ortholoc_edge.adapters.mavlink.gimbal import GimbalSelection
 from ortholoc_edge.adapters.mavlink.latency import DelayAdvice, LatencyMeter, advise
 from ortholoc_edge.adapters.mavlink.log import LimitedLog
 from ortholoc_edge.adapters.mavlink.monitor import FusionMonitor, FusionReport
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus
+from ortholoc_edge.adapters.mavlink.outlet import Outlet
 from ortholoc_edge.adapters.mavlink.release import Outgoing, Release
+from ortholoc_edge.adapters.mavlink.sinks import Sink
 from ortholoc_edge.adapters.mavlink.sources import PendingSwitch
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity, AutopilotState
 from ortholoc_edge.adapters.mavlink.streams import Repeat, Stream
@@ -52,13 +49,15 @@ class LinkProtocol:
     and sends what both return, in order.
     """
 
-    def __init__(self, options: LinkOptions) -> None:
+    def __init__(self, options: LinkOptions, gimbal: GimbalSelection | None = None) -> None:
         self._options = options
         self._log = LimitedLog()
         self.system_status = SystemStatus.BOOT
         self.timesync = TimeSync()
         self.counts: Counter[str] = Counter()
-        self.telemetry = Telemetry(self.timesync, self.counts, options.attitude_rate_hz, options.position_rate_hz)
+        self.telemetry = Telemetry(
+            self.timesync, self.counts, options.attitude_rate_hz, options.position_rate_hz, gimbal
+        )
         self.release = Release(options)
         self.latency = LatencyMeter()
         self.monitor = FusionMonitor()
@@ -77,6 +76,7 @@ class LinkProtocol:
         self._home_timer = Repeat(2 * _S, 10 * _S)
         self._monitor_timer = Repeat(_S // 2)
         self._advice_timer = Repeat(60 * _S)
+        self._outlet = Outlet(options, self.counts, self._log)
         self._handlers: dict[str, Callable[[MavlinkMessage, int], None]] = {
             "HOME_POSITION": self._on_home,
             "AUTOPILOT_VERSION": self._on_version,
@@ -116,7 +116,9 @@ class LinkProtocol:
             self._on_heartbeat(message, system, arrival_ns)
             return []
         if self._vehicle is None or (system, component) != (self._vehicle.system_id, _AUTOPILOT_COMPONENT):
-            self.counts["ignored"] += 1
+            ours = self._vehicle is not None and system == self._vehicle.system_id
+            taken = ours and self.telemetry.take_of_component(message, arrival_ns)
+            self.counts[f"received.{name}" if taken else "ignored"] += 1
             return []
         self.counts[f"received.{name}"] += 1
         if name in self._streams:
@@ -268,7 +270,10 @@ class LinkProtocol:
         ts1 = self.timesync.due(now_ns)
         if ts1 is not None:
             out.append(dialect.MAVLink_timesync_message(tc1=0, ts1=ts1))
-        if vehicle.firmware_version is None and self._version_timer.due(now_ns):
+        if vehicle.firmware_version is not None:
+            # What is doubtful about the choice is told before the first estimate.
+            self._outlet.sinks(vehicle)
+        elif self._version_timer.due(now_ns):
             out.append(self._request(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION))
         if (self._origin_timer if self.telemetry.origin is None else self._origin_watch_timer).due(now_ns):
             out.append(self._request(dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN))
@@ -282,14 +287,22 @@ class LinkProtocol:
             for stream in self._streams.values()
             if stream.due(now_ns)
         ]
-        number = self.source_set.due(now_ns)
-        if number is not None:
-            out.append(self._command(dialect.MAV_CMD_SET_EKF_SOURCE_SET, number))
+        out += self._watch(vehicle.autopilot, now_ns)
+        if self.telemetry.gimbal is not None:
+            out += [
+                self._command(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_ns / 1e3, component)
+                for component, message_id, interval_ns in self.telemetry.gimbal.requests(now_ns)
+            ]
+        return out
+
+    def _watch(self, autopilot: Autopilot, now_ns: int) -> list[MavlinkMessage]:
+        """See what becomes of the fixes; returns the command for a source set where one is due."""
         if self._monitor_timer.due(now_ns):
-            self.monitor.assess(now_ns, self.state_at, vehicle.autopilot)
+            self.monitor.assess(now_ns, self.state_at, autopilot)
         if self._advice_timer.due(now_ns):
             self._tell_delays()
-        return out
+        number = self.source_set.due(now_ns)
+        return [] if number is None else [self._command(dialect.MAV_CMD_SET_EKF_SOURCE_SET, number)]
 
     def sent(self, outgoing: Outgoing, now_ns: int) -> None:
         """An estimate was handed to the line."""
@@ -317,17 +330,21 @@ class LinkProtocol:
             self._advice = advice
             logger.info("measured latency asks for %s", advice)
 
-    def encode_estimate(self, estimate: VisionEstimate) -> list[MavlinkMessage]:
-        """The messages for an estimate, in the form that the autopilot found reads; none before it was
-        found."""
+    @property
+    def sinks(self) -> tuple[Sink, ...]:
+        """What carries estimates to the autopilot found; empty before it was found."""
+        return () if self._vehicle is None else self._outlet.sinks(self._vehicle)
+
+    def encode_estimate(
+        self, estimate: VisionEstimate, now_ns: int, wall_ns: int = 0, recovery: bool = False
+    ) -> list[MavlinkMessage]:
+        """The messages for an estimate, in the form that the autopilot found reads; none before it was found.
+
+        See :meth:`Outlet.encode`.
+        """
         if self._vehicle is None:
             return []
-        layout = covariance_layout(self._vehicle.autopilot, self._vehicle.firmware_version)
-        encoders = {
-            "vision_position_estimate": encode_vision_position_estimate,
-            "odometry": encode_odometry,
-        }
-        return [encoders[name](estimate, layout) for name in self._options.send]
+        return self._outlet.encode(estimate, self._vehicle, self.telemetry.origin, now_ns, wall_ns, recovery)
 
     def offer_origin(self, origin: GeodeticOrigin) -> None:
         """See :meth:`AutopilotLink.offer_origin`."""
@@ -336,10 +353,12 @@ class LinkProtocol:
     def _request(self, message_id: int) -> MavlinkMessage:
         return self._command(dialect.MAV_CMD_REQUEST_MESSAGE, message_id)
 
-    def _command(self, command: int, param1: float, param2: float = 0.0) -> MavlinkMessage:
+    def _command(
+        self, command: int, param1: float, param2: float = 0.0, component: int = _AUTOPILOT_COMPONENT
+    ) -> MavlinkMessage:
         return dialect.MAVLink_command_long_message(
             target_system=self._vehicle.system_id if self._vehicle else 0,
-            target_component=_AUTOPILOT_COMPONENT,
+            target_component=component,
             command=command,
             confirmation=0,
             param1=float(param1),
@@ -387,6 +406,7 @@ class LinkProtocol:
             "autopilot": vehicle.autopilot.value if vehicle else None,
             "vehicle_system_id": vehicle.system_id if vehicle else None,
             "firmware": ".".join(map(str, version)) if version else None,
+            "gimbal": None if self.telemetry.gimbal is None else str(self.telemetry.gimbal),
             "origin_known": self.telemetry.origin is not None,
             "local_epoch": self.telemetry.local_epoch,
             "synchronised": self.timesync.synchronised,

@@ -38,6 +38,7 @@ from statistics import median
 import numpy as np
 
 from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate
+from ortholoc_edge.adapters.mavlink.geodesy import Place, moved
 from ortholoc_edge.adapters.mavlink.options import LinkOptions
 from ortholoc_edge.adapters.mavlink.state import AutopilotState
 from ortholoc_edge.geometry.arrays import FloatArray
@@ -127,7 +128,7 @@ class Release:
             self.counts["bad_capture_stamps"] += 1
             return 1
         state = look(estimate.stamp_ns)
-        taken = _Taken(estimate, now_ns, None if state is None else state.origin)
+        taken = _Taken(estimate, now_ns, estimate.origin or (None if state is None else state.origin))
         if newest is not None:
             self._intervals_ns.append(min(now_ns - newest.arrival_ns, self._max_repeat_ns))
             self._compare(newest.estimate, estimate, look)
@@ -203,12 +204,13 @@ class Release:
             return None
         elapsed_s = (now_ns - fix.estimate.stamp_ns) / _S
         covariance = fix.estimate.covariance + _noise(step, elapsed_s)
-        # The displacement is in true metres, the position in the autopilot's, which differ by up to 0.7 %: 7 cm
-        # in 10 m.
         return replace(
             fix.estimate,
             stamp_ns=now_ns,
-            position_ned_m=fix.estimate.position_ned_m + step,
+            # The displacement is in true metres, the position in the autopilot's, which differ by up to 0.7 %: 7 cm
+            # in 10 m. The place follows the position, where there are both.
+            position_ned_m=None if fix.estimate.position_ned_m is None else fix.estimate.position_ned_m + step,
+            place=None if fix.estimate.place is None else _moved(fix.estimate.place, step),
             ned_from_body=_turned(fix.estimate.ned_from_body, then.ned_from_body, now.ned_from_body),
             covariance=covariance / shares(self._expected(), fix.released),
         )
@@ -220,7 +222,7 @@ class Release:
         if then is None or now is None or elapsed_ns > _COMPARE_NS or old.reset_counter != new.reset_counter:
             return
         step = displacement(then, now)
-        if step is None or then.origin != now.origin:
+        if step is None or then.origin != now.origin or old.position_ned_m is None or new.position_ned_m is None:
             return
         covariance = (old.covariance + new.covariance + _noise(step, elapsed_ns / _S))[:2, :2]
         error = (new.position_ned_m - old.position_ned_m - step)[:2]
@@ -246,6 +248,14 @@ def _turned(fix: FloatArray, then: FloatArray, now: FloatArray) -> FloatArray:
     axes of NED, as an error of heading does."""
     turned: FloatArray = fix @ then.T @ now
     return turned
+
+
+def _moved(place: Place, step: FloatArray) -> Place:
+    latitude_deg, longitude_deg, height_amsl_m = moved(
+        place.latitude_deg, place.longitude_deg, place.height_amsl_m, step
+    )
+    ellipsoid_m = None if place.height_ellipsoid_m is None else place.height_ellipsoid_m - float(step[2])
+    return Place(latitude_deg, longitude_deg, height_amsl_m, ellipsoid_m)
 
 
 def _noise(step: FloatArray, elapsed_s: float) -> FloatArray:
