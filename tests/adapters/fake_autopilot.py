@@ -23,6 +23,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from ortholoc_edge.adapters.mavlink.codec import payload_of
 from ortholoc_edge.geometry import rotation
 
 
@@ -273,7 +274,8 @@ class FakeAutopilot:
         if isinstance(value, float):
             kind = dialect.MAV_PARAM_TYPE_REAL32
         else:
-            kind = dialect.MAV_PARAM_TYPE_INT32 if px4 else dialect.MAV_PARAM_TYPE_INT8
+            small = dialect.MAV_PARAM_TYPE_INT8 if abs(value) < 128 else dialect.MAV_PARAM_TYPE_INT16
+            kind = dialect.MAV_PARAM_TYPE_INT32 if px4 else small
         wire = struct.unpack("<f", struct.pack("<i", value))[0] if px4 and isinstance(value, int) else float(value)
         self._send(dialect.MAVLink_param_value_message(name.encode(), wire, kind, 999, 65535))
 
@@ -284,7 +286,7 @@ class FakeAutopilot:
             kind = dialect.MAV_PARAM_TYPE_INT32 if integer else dialect.MAV_PARAM_TYPE_REAL32
             if message.param_type != kind:
                 return None  # "param types mismatch"
-            raw = bytes(message.get_payload()[:4]).ljust(4, b"\0")
+            raw = payload_of(message, 4)[:4]
             return struct.unpack("<i" if integer else "<f", raw)[0]
         if not math.isfinite(message.param_value):
             return None

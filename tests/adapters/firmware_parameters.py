@@ -5,7 +5,7 @@ ARDUPILOT_STOCK: dict[str, int | float] = {
     "AHRS_EKF_TYPE": 3,
     "EK3_ENABLE": 1,
     "EK3_GLITCH_RAD": 25,
-    "EK3_POS_I_GATE": 500.0,
+    "EK3_POS_I_GATE": 500,
     "VISO_TYPE": 0,
     "VISO_DELAY_MS": 10,
     "VISO_POS_X": 0.0,

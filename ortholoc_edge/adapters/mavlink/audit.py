@@ -308,7 +308,6 @@ def _timesync(situation: Situation) -> Iterator[Finding]:
     health = situation.health
     if health.vehicle is None:
         return
-    round_trip_ms = health.round_trip_ms
     if not health.synchronised:
         yield Finding(
             Level.WARNING, "TIMESYNC", "too few answers", "answered",
@@ -316,8 +315,7 @@ def _timesync(situation: Situation) -> Iterator[Finding]:
             "check that a router passes TIMESYNC, and the load of the line",
         )  # fmt: skip
         return
-    slow = round_trip_ms is not None and round_trip_ms >= _PX4_MOST_ROUND_TRIP_MS
-    if slow and situation.autopilot is Autopilot.PX4:
+    if situation.autopilot is Autopilot.PX4 and _slow_for_px4(health):
         yield Finding(
             Level.ERROR, "TIMESYNC", f"{health.round_trip_ms:.1f} ms", f"below {_PX4_MOST_ROUND_TRIP_MS:g} ms",
             "PX4 discards slower round trips, so it never believes our stamps and takes the time of arrival instead",
@@ -566,8 +564,20 @@ def _ev_ctrl(situation: Situation) -> Iterator[Finding]:
         )  # fmt: skip
 
 
+def _slow_for_px4(health: LinkHealth) -> bool:
+    return health.round_trip_ms is not None and health.round_trip_ms >= _PX4_MOST_ROUND_TRIP_MS
+
+
 def _ev_delay(situation: Situation) -> Iterator[Finding]:
-    yield from _delay(situation, "EKF2_EV_DELAY", _MOST_EV_DELAY_MS)
+    """PX4 takes our stamps of exposure as soon as its TIMESYNC has converged; if it can't, the time of arrival."""
+    found = situation.value("EKF2_EV_DELAY")
+    if _slow_for_px4(situation.health):
+        yield from _delay(situation, "EKF2_EV_DELAY", _MOST_EV_DELAY_MS)
+    elif found is not None and found > _DELAY_SLACK_MS:
+        yield from _setting(
+            situation, Level.WARNING, "EKF2_EV_DELAY", 0,
+            "our stamps are those of the exposure, so a latency that is set here too is taken off twice", reboot=True,
+        )  # fmt: skip
 
 
 def _ev_noise(situation: Situation) -> Iterator[Finding]:

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
-from ortholoc_edge.adapters.mavlink.codec import MavlinkMessage, dialect
+from ortholoc_edge.adapters.mavlink.codec import MavlinkMessage, dialect, payload_of
 from ortholoc_edge.adapters.mavlink.estimates import Autopilot
 
 Number = int | float
@@ -280,8 +280,7 @@ def decode_value(message: MavlinkMessage, autopilot: Autopilot) -> Number | None
         if kind not in _BYTEWISE:
             return None  # PX4 has integers of 32 bits only
         # From the bytes: as a float, an integer of -1 is not a number.
-        raw = bytes(message.get_payload()[:4]).ljust(4, b"\0")
-        return int(struct.unpack(_BYTEWISE[kind], raw)[0])
+        return int(struct.unpack_from(_BYTEWISE[kind], payload_of(message, 4))[0])
     value = float(message.param_value)
     low, high = _INTEGERS[kind]
     return int(value) if math.isfinite(value) and value == round(value) and low <= value <= high else None
