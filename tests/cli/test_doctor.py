@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from adapters.fake_autopilot import FakeAutopilot, PtyWire, UdpWire
+from adapters.firmware_parameters import ARDUPILOT_READY, ARDUPILOT_STOCK, PX4_STOCK
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from ortholoc_edge.cli import doctor, main
-from tests.adapters.fake_autopilot import FakeAutopilot, PtyWire, UdpWire
-from tests.adapters.firmware_parameters import ARDUPILOT_READY, ARDUPILOT_STOCK, PX4_STOCK
 
 CONFIG = Path(__file__).resolve().parents[2] / "config" / "example.toml"
 
