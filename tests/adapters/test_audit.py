@@ -8,7 +8,8 @@ import pytest
 
 from ortholoc_edge.adapters.mavlink.audit import Finding, Level, Situation, audit, parameters_wanted
 from ortholoc_edge.adapters.mavlink.census import LinkHealth, Peer
-from ortholoc_edge.adapters.mavlink.estimates import Autopilot, GeodeticOrigin
+from ortholoc_edge.adapters.mavlink.estimates import Autopilot
+from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin
 from ortholoc_edge.adapters.mavlink.parameters import Answer, Reading
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity
 

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ortholoc_edge.adapters.mavlink.codec import MavlinkMessage, dialect
-from ortholoc_edge.adapters.mavlink.estimates import Autopilot, GeodeticOrigin
+from ortholoc_edge.adapters.mavlink.estimates import Autopilot
+from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity
 
 _S = 1_000_000_000
