@@ -29,6 +29,8 @@ from ortholoc_edge.adapters.mavlink import (
     Statistic,
     SystemStatus,
 )
+from ortholoc_edge.adapters.mavlink.audit import Level
+from ortholoc_edge.adapters.mavlink.checkup import Checkup
 from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate
 from ortholoc_edge.adapters.mavlink.geodesy import EarthModel, GeodeticOrigin, Place, ned_from_geodetic
 from ortholoc_edge.adapters.mavlink.herald import Herald
@@ -65,6 +67,7 @@ _STATE_WAIT_NS = 150_000_000
 _MAX_ERRORS_IN_A_ROW = 5
 _STATUS_INTERVAL_NS = 1_000_000_000
 _FRESH_FIX_NS = 3_000_000_000
+_MOST_AUDIT_TEXTS = 3
 # A read returns within `_WAIT_S`; a driver that holds it this long is not coming back by itself.
 _CAPTURE_HUNG_NS = 5_000_000_000
 _S = 1_000_000_000
@@ -175,6 +178,9 @@ class Daemon:
         self._last_fix_ns: int | None = None
         self._counts: Counter[str] = Counter()
         self._origin_missing = False
+        self._checkup: Checkup | None = Checkup(
+            self._link, config.link, lever_arm_m=config.mount.lever_arm_m, latency_ms=None
+        )
         self._damage_reported = 0
         self._origin: GeodeticOrigin | None = None
         self._recovering = False
@@ -434,6 +440,7 @@ class Daemon:
         if self._link.connected():
             self._report_damage()
             self._report_autopilot(now_ns, fresh)
+            self._report_audit(now_ns)
         if self._origin_missing and self._link.connected():
             self._link.send_status_text(Severity.WARNING, "OrthoLoC: EKF origin unknown, fixes not sent")
             self._origin_missing = False
@@ -455,6 +462,25 @@ class Daemon:
             self._link.send_status_text(Severity.WARNING, switch.text)
         if self._bus is not None:
             self._bus.publish_autopilot(autopilot_record(now_ns, self._link, witness, self._sources.on_vision))
+
+    def _report_audit(self, now_ns: int) -> None:
+        """Say once what is wrong with the autopilot's settings."""
+        if self._checkup is None or not self._checkup.step(now_ns):
+            return
+        findings = [finding for finding in self._checkup.findings() if finding.level is not Level.NOTE]
+        self._checkup = None
+        for finding in findings:
+            logger.warning(
+                "autopilot: %s is %s, wanted %s: %s; %s",
+                finding.subject, finding.found, finding.wanted, finding.why, finding.remedy,
+            )  # fmt: skip
+        errors = [finding for finding in findings if finding.level is Level.ERROR and finding.change is not None]
+        for finding in errors[:_MOST_AUDIT_TEXTS]:
+            text = f"OrthoLoC: {finding.subject} is {finding.found}, wants {finding.wanted}"
+            self._link.send_status_text(Severity.WARNING, text)
+        if len(errors) > _MOST_AUDIT_TEXTS:
+            self._link.send_status_text(Severity.WARNING, f"OrthoLoC: {len(errors)} settings wrong, see doctor")
+        self._counts["audit_findings"] = len(findings)
 
     def _report_damage(self) -> None:
         """Say that the map has holes: once the autopilot is there, and again if more are found in flight."""

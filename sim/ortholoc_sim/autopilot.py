@@ -43,6 +43,27 @@ _BASE_MODE, _GUIDED = 217, 4
 _EKF_GOOD = 0x01 | 0x02 | 0x04 | 0x08 | 0x10 | 0x20 | 0x200  # attitude, velocities, positions, prediction
 _EKF_DEAD_RECKONING = 0x01 | 0x02 | 0x04 | 0x20 | 0x80  # no absolute horizontal position; constant position mode
 
+# Of an ArduPilot that is set up for vision in its second source set, so that the daemon's audit finds nothing wrong.
+_PARAMETERS: dict[str, int | float] = {
+    "AHRS_EKF_TYPE": 3,
+    "EK3_ENABLE": 1,
+    "EK3_GLITCH_RAD": 25,
+    "EK3_POS_I_GATE": 500,
+    **{f"EK3_SRC{n}_POSXY": source for n, source in ((1, 3), (2, 6), (3, 0))},
+    **{f"EK3_SRC{n}_VELXY": source for n, source in ((1, 3), (2, 0), (3, 0))},
+    **{f"EK3_SRC{n}_VELZ": source for n, source in ((1, 3), (2, 0), (3, 0))},
+    **{f"EK3_SRC{n}_{what}": 1 for n in (1, 2, 3) for what in ("POSZ", "YAW")},
+    "VISO_TYPE": 1,
+    "VISO_DELAY_MS": 100,
+    "VISO_ORIENT": 0,
+    "VISO_SCALE": 1.0,
+    "VISO_POS_X": 0.0,
+    "VISO_POS_Y": 0.0,
+    "VISO_POS_Z": 0.0,
+    "VISO_POS_M_NSE": 0.2,
+    "VISO_QUAL_MIN": 0,
+}
+
 
 @dataclass(frozen=True, slots=True)
 class SensorOptions:
@@ -493,9 +514,28 @@ class AutopilotCore:
         elif name == "VISION_POSITION_ESTIMATE":
             position = np.array([message.x, message.y, message.z])
             self._vision(message.usec, position, message.covariance, message.reset_counter, 0, boot_ns)
+        elif name == "PARAM_REQUEST_READ" and message.target_system == self.options.system_id:
+            return self._parameter(message.param_id)
         elif name == "SET_GPS_GLOBAL_ORIGIN":
             self.counts["origin_refused"] += 1  # it has one, from GNSS
         return []
+
+    @staticmethod
+    def _parameter(name: str) -> list[Message]:
+        """As ArduPilot: numbers of any type as a float, and silence for a name that it does not have."""
+        if name not in _PARAMETERS:
+            return []
+        value = _PARAMETERS[name]
+        kind = dialect.MAV_PARAM_TYPE_REAL32 if isinstance(value, float) else dialect.MAV_PARAM_TYPE_INT16
+        return [
+            dialect.MAVLink_param_value_message(
+                param_id=name.encode(),
+                param_value=float(value),
+                param_type=kind,
+                param_count=len(_PARAMETERS),
+                param_index=65535,
+            )
+        ]
 
     def _command(self, message: Message) -> list[Message]:
         def ack(result: int) -> Message:

@@ -24,6 +24,7 @@ import msgspec
 import numpy as np
 import pytest
 from adapters.fake_autopilot import FakeAutopilot, PtyWire, UdpWire, Wire, dialect
+from adapters.firmware_parameters import ARDUPILOT_STOCK
 from ortholoc_sim.site import Site
 from replay import rendered
 
@@ -253,6 +254,31 @@ def test_without_an_origin_nothing_is_sent(folder: Path) -> None:
     assert autopilot.messages("VISION_POSITION_ESTIMATE") == []
     assert autopilot.got_counts["SET_GPS_GLOBAL_ORIGIN"] == 0
     assert "not sent" in texts[0]
+
+
+def test_wrong_settings_are_told_once(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The ground station sees which parameter is wrong; the log has the command that mends it."""
+    wire = UdpWire()
+    autopilot = HoveringAutopilot(wire)
+    autopilot.parameters = dict(ARDUPILOT_STOCK)
+    daemon = Daemon(config(f"folder:{folder}", f"udpout:127.0.0.1:{wire.port}"))
+    try:
+        with running(daemon):
+            wait_for(lambda: len(settings(autopilot)) == 2 and "audit_findings" in daemon.statistics(), "the audit")
+            asked = autopilot.got_counts["PARAM_REQUEST_READ"]
+            wait_for(lambda: len(autopilot.messages("HEARTBEAT")) >= 12, "some seconds more")
+    finally:
+        autopilot.close()
+    assert settings(autopilot) == [
+        "OrthoLoC: VISO_TYPE is 0, wants 1",
+        "OrthoLoC: EK3_SRC2_POSXY is 0, wants 6",
+    ]
+    assert "param set VISO_TYPE 1" in caplog.text
+    assert autopilot.got_counts["PARAM_REQUEST_READ"] == asked and autopilot.got_counts["PARAM_SET"] == 0
+
+
+def settings(autopilot: HoveringAutopilot) -> list[str]:
+    return [message.text for message in autopilot.messages("STATUSTEXT") if "wants" in message.text]
 
 
 def test_origin_is_offered_where_that_is_allowed(folder: Path) -> None:

@@ -8,9 +8,11 @@ import select
 import socket
 import threading
 from collections import Counter, deque
+from collections.abc import Iterable, Mapping
 from types import TracebackType
 from typing import Any
 
+from ortholoc_edge.adapters.mavlink.census import LinkHealth
 from ortholoc_edge.adapters.mavlink.codec import FrameParser, MavlinkMessage, dialect
 from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate
 from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin
@@ -19,6 +21,7 @@ from ortholoc_edge.adapters.mavlink.latency import DelayAdvice
 from ortholoc_edge.adapters.mavlink.log import LimitedLog
 from ortholoc_edge.adapters.mavlink.monitor import FusionReport
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus, parse_endpoint
+from ortholoc_edge.adapters.mavlink.parameters import Number, Reading, Written
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol, Statistic
 from ortholoc_edge.adapters.mavlink.sinks import Sink
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity, AutopilotState
@@ -230,6 +233,38 @@ class AutopilotLink:
         """
         with self._lock:
             self._protocol.offer_origin(origin)
+
+    def read_parameters(self, names: Iterable[str]) -> None:
+        """Ask the autopilot for these; :meth:`parameters` tells what came. Before one was found they wait.
+
+        Raises: ValueError for a name that MAVLink can't carry.
+        """
+        with self._lock:
+            self._protocol.parameters.read(names)
+
+    def write_parameter(self, name: str, value: Number) -> None:
+        """Set one that was read; :meth:`written_parameters` tells the outcome. One at a time.
+
+        Raises: ValueError if it was not read, another is being set, or its type can't hold the value.
+        """
+        with self._lock:
+            self._protocol.parameters.write(name, value)
+
+    def parameters(self) -> tuple[Mapping[str, Reading], bool]:
+        """What was asked for, as far as it is known; and whether all questions and changes are settled."""
+        with self._lock:
+            return self._protocol.parameters.readings, not self._protocol.parameters.busy
+
+    def written_parameters(self) -> list[Written]:
+        """Changes that came to an end since the last call."""
+        with self._lock:
+            return self._protocol.parameters.take_written()
+
+    def health(self) -> LinkHealth:
+        """Who is on the link and how well it carries."""
+        with self._lock:
+            bad_bytes = self._retired["bad_bytes"] + sum(p.bad_bytes for p in self._parsers.values())
+            return self._protocol.health(self._clock.now_ns(), bad_bytes)
 
     def statistics(self) -> dict[str, Statistic]:
         """Counters since the start, flat: ``sent.NAME``, ``received.NAME``, ``bad_frames``, ``reconnects``

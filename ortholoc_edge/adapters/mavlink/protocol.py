@@ -6,6 +6,7 @@ import logging
 from collections import Counter
 from collections.abc import Callable
 
+from ortholoc_edge.adapters.mavlink.census import Census, LinkHealth
 from ortholoc_edge.adapters.mavlink.codec import MavlinkMessage, dialect
 from ortholoc_edge.adapters.mavlink.estimates import Autopilot, VisionEstimate
 from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin
@@ -15,6 +16,7 @@ from ortholoc_edge.adapters.mavlink.log import LimitedLog
 from ortholoc_edge.adapters.mavlink.monitor import FusionMonitor, FusionReport
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus
 from ortholoc_edge.adapters.mavlink.outlet import Outlet
+from ortholoc_edge.adapters.mavlink.parameters import ParameterClient
 from ortholoc_edge.adapters.mavlink.release import Outgoing, Release
 from ortholoc_edge.adapters.mavlink.sinks import Sink
 from ortholoc_edge.adapters.mavlink.sources import PendingSwitch
@@ -63,6 +65,8 @@ class LinkProtocol:
         self.monitor = FusionMonitor()
         self.source_set = PendingSwitch()
         self._advice: DelayAdvice | None = None
+        self.parameters = ParameterClient()
+        self._census = Census()
         self._vehicle: AutopilotIdentity | None = None
         self._heartbeat_ns = 0
         self._silent = False
@@ -82,6 +86,8 @@ class LinkProtocol:
             "AUTOPILOT_VERSION": self._on_version,
             "STATUSTEXT": self._on_status_text,
             "COMMAND_ACK": self._on_command_ack,
+            "PARAM_VALUE": self._on_parameter,
+            "PARAM_ERROR": lambda m, arrival_ns: self.parameters.on_error(m),
             "TIMESYNC": lambda m, arrival_ns: self.timesync.answered(m.tc1, m.ts1, arrival_ns),
         }
 
@@ -109,6 +115,7 @@ class LinkProtocol:
         """Take in one message; returns what must be answered at once."""
         system, component = message.get_srcSystem(), message.get_srcComponent()
         name = message.get_type()
+        self._census.take(message)
         if system == self.own_system_id and component == self._options.component_id:
             self.counts["own_echo"] += 1
             return []
@@ -121,6 +128,7 @@ class LinkProtocol:
             self.counts[f"received.{name}" if taken else "ignored"] += 1
             return []
         self.counts[f"received.{name}"] += 1
+        self._census.take_vehicles(name, arrival_ns)
         if name in self._streams:
             self._streams[name].heard(arrival_ns)
         if name == "TIMESYNC" and message.tc1 == 0:
@@ -213,6 +221,8 @@ class LinkProtocol:
             stream.restart()
         for timer in (self._version_timer, self._origin_timer, self._home_timer):
             timer.restart()
+        self.parameters.restart()
+        self._census.restart()
 
     def _on_home(self, m: MavlinkMessage, arrival_ns: int) -> None:
         self._home_known = True
@@ -240,6 +250,10 @@ class LinkProtocol:
                 logger.warning("autopilot refuses to take EKF source set %d (result %d)", number, m.result)
         if m.result not in (dialect.MAV_RESULT_ACCEPTED, dialect.MAV_RESULT_IN_PROGRESS):
             self.counts["commands_refused"] += 1
+
+    def _on_parameter(self, m: MavlinkMessage, arrival_ns: int) -> None:
+        if self._vehicle is not None:
+            self.parameters.on_value(m, self._vehicle.autopilot, arrival_ns)
 
     # -- out --------------------
 
@@ -293,6 +307,7 @@ class LinkProtocol:
                 self._command(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_ns / 1e3, component)
                 for component, message_id, interval_ns in self.telemetry.gimbal.requests(now_ns)
             ]
+        out += self.parameters.poll(now_ns, vehicle.system_id, vehicle.autopilot)
         return out
 
     def _watch(self, autopilot: Autopilot, now_ns: int) -> list[MavlinkMessage]:
@@ -384,6 +399,26 @@ class LinkProtocol:
     def state_at(self, stamp_ns: int) -> AutopilotState | None:
         """See :meth:`AutopilotLink.state_at`."""
         return self.telemetry.state_at(stamp_ns) if self._vehicle is not None else None
+
+    def health(self, now_ns: int, bad_bytes: int) -> LinkHealth:
+        """See :meth:`AutopilotLink.health`."""
+        round_trip_ns = self.timesync.median_round_trip_ns
+        return LinkHealth(
+            peers=self._census.peers,
+            vehicle=self._vehicle,
+            connected=self.connected(now_ns),
+            wanted_system_id=self._options.system_id,
+            own_id_heard=self.counts["own_echo"] > 0,
+            mavlink1=self._census.mavlink1,
+            mavlink2=self._census.mavlink2,
+            bad_bytes=bad_bytes,
+            rates_hz=self._census.rates_hz(now_ns),
+            wanted_rates_hz={name: _S / stream.interval_ns for name, stream in self._streams.items()},
+            round_trip_ms=None if round_trip_ns is None else round_trip_ns / _MS,
+            synchronised=self.timesync.synchronised,
+            origin=self.telemetry.origin,
+            set_origin=self._options.set_origin,
+        )
 
     def statistics(self, now_ns: int) -> dict[str, Statistic]:
         """Counters and the state of synchronisation."""
