@@ -24,6 +24,7 @@ from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
 from ortholoc_edge.pipeline.navigator import TimingOptions
 from ortholoc_edge.pipeline.tracker import TrackerOptions
+from ortholoc_edge.pipeline.witness import WitnessOptions
 
 # The coarsest level of XFeat's network is at 1/32.
 _XFEAT_MULTIPLE_PX = 32
@@ -191,6 +192,7 @@ class Config(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     matcher: MatcherOptions = field(default_factory=MatcherOptions)
     localizer: LocalizerOptions = field(default_factory=LocalizerOptions)
     tracker: TrackerOptions = field(default_factory=TrackerOptions)
+    witness: WitnessOptions = field(default_factory=WitnessOptions)
     attitude: AttitudeOptions = field(default_factory=AttitudeOptions)
     timing: TimingOptions = field(default_factory=TimingOptions)
     log: LogOptions = field(default_factory=LogOptions)

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 from ortholoc_edge.adapters import systemd
-from ortholoc_edge.adapters.bus import Bus
+from ortholoc_edge.adapters.bus import AutopilotRecord, Bus
 from ortholoc_edge.adapters.camera import BadFrameError, EndOfFrames, FrameSource, open_source
 from ortholoc_edge.adapters.mavlink import (
     AutopilotLink,
@@ -33,7 +33,9 @@ from ortholoc_edge.adapters.mavlink.audit import Level
 from ortholoc_edge.adapters.mavlink.checkup import Checkup
 from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate
 from ortholoc_edge.adapters.mavlink.geodesy import EarthModel, GeodeticOrigin, Place, ned_from_geodetic
+from ortholoc_edge.adapters.mavlink.herald import Herald
 from ortholoc_edge.adapters.mavlink.sinks import earth_model
+from ortholoc_edge.adapters.mavlink.sources import SourceSwitch
 from ortholoc_edge.adapters.recorder import Recorder
 from ortholoc_edge.clock import Clock, SystemClock
 from ortholoc_edge.config import Config
@@ -49,6 +51,7 @@ from ortholoc_edge.pipeline.localizer import Localizer
 from ortholoc_edge.pipeline.navigator import Navigator
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.tracker import Tracker, TrackerStatus
+from ortholoc_edge.pipeline.witness import WitnessReport
 from ortholoc_edge.pose import pnp
 from ortholoc_edge.tiles.georeference import Georeference
 from ortholoc_edge.tiles.pack import Pack
@@ -157,7 +160,7 @@ class Daemon:
             first_reset_counter = self._clock.now_ns() // _S
             gimbal = config.mount.gimbal_selection()
             fixed = config.mount.body_from_camera() if gimbal is None else None
-            tracker = Tracker(self._georeference, fixed, config.tracker, first_reset_counter)
+            tracker = Tracker(self._georeference, fixed, config.tracker, first_reset_counter, config.witness)
             self._navigator = Navigator(localizer, tracker, config.timing.budget_ms)
             self._link = AutopilotLink(config.link, self._clock, gimbal)
             self._bus = resources.enter_context(closing(Bus(config.bus))) if config.bus.enabled else None
@@ -182,18 +185,23 @@ class Daemon:
         self._origin: GeodeticOrigin | None = None
         self._recovering = False
         self._last_status_ns = 0
+        self._herald = Herald()
+        self._sources = SourceSwitch(config.link)
 
     @property
     def link(self) -> AutopilotLink:
         return self._link
 
     def statistics(self) -> dict[str, Statistic]:
-        """Counters since the start: ours, the recorder's and the bus's drops, and the link's under ``link.``; and the
-        rung of detail that frames are localized at."""
+        """Counters since the start: ours, the recorder's and the bus's drops, and the link's under ``link.``; the
+        rung of detail that frames are localized at, and whether GNSS agrees with the fixes."""
+        witness = self._navigator.tracker.witness.report
         return {
             **self._counts,
             "frames_replaced": self._slot.replaced,
             "rung": self._navigator.ladder.rung,
+            "gnss_consistency": witness.state.value,
+            "gnss_apart_m": witness.apart_m,
             "map_files_damaged": len(self._store.damaged),
             "log_dropped": 0 if self._recorder is None else self._recorder.dropped,
             "bus_dropped": 0 if self._bus is None else self._bus.dropped,
@@ -208,7 +216,7 @@ class Daemon:
         with self._resources as resources:
             self._warm_up()
             self._link.set_system_status(SystemStatus.STANDBY)
-            resources.callback(lambda: logger.info("stopped: %s", self.statistics()))
+            resources.callback(self._say_goodbye)
             resources.callback(self._link.stop)
             self._link.start()
             capture = threading.Thread(target=self._capture, args=(stop,), name="capture", daemon=True)
@@ -224,6 +232,12 @@ class Daemon:
             self._work(stop)
         if self._capture_failure is not None:
             raise CameraError(f"the camera thread ended: {self._capture_failure}") from self._capture_failure
+
+    def _say_goodbye(self) -> None:
+        logger.info("stopped: %s", self.statistics())
+        advice = self._link.delay_advice
+        if advice is not None:
+            logger.info("measured latency asks for %s", advice)
 
     def _join_capture(self, capture: threading.Thread, stop: threading.Event) -> None:
         stop.set()
@@ -425,10 +439,29 @@ class Daemon:
         systemd.notify(f"STATUS={status}, {self._counts['fixes']} fixes, {self._counts['rejected']} rejected")
         if self._link.connected():
             self._report_damage()
+            self._report_autopilot(now_ns, fresh)
             self._report_audit(now_ns)
         if self._origin_missing and self._link.connected():
             self._link.send_status_text(Severity.WARNING, "OrthoLoC: EKF origin unknown, fixes not sent")
             self._origin_missing = False
+
+    def _report_autopilot(self, now_ns: int, fixes_fresh: bool) -> None:
+        """Say and publish what the autopilot does with the fixes and whether GNSS agrees with them; switch its source
+        if that was enabled."""
+        fusion, witness = self._link.fusion, self._navigator.tracker.witness.report
+        for severity, text in self._herald.tell(fusion, witness):
+            logger.log(logging.INFO if severity >= Severity.NOTICE else logging.WARNING, "%s", text)
+            self._link.send_status_text(severity, text)
+        vehicle = self._link.vehicle
+        autopilot = vehicle.autopilot if vehicle else None
+        switch = self._sources.decide(witness.state, fixes_fresh, autopilot, self._link.restarts, now_ns)
+        if switch is not None:
+            logger.warning("%s", switch.text)
+            self._counts[f"switched_to_{switch.source}"] += 1
+            self._link.take_source_set(switch.number)
+            self._link.send_status_text(Severity.WARNING, switch.text)
+        if self._bus is not None:
+            self._bus.publish_autopilot(autopilot_record(now_ns, self._link, witness, self._sources.on_vision))
 
     def _report_audit(self, now_ns: int) -> None:
         """Say once what is wrong with the autopilot's settings."""
@@ -457,6 +490,31 @@ class Daemon:
         self._damage_reported = len(damaged)
         logger.warning("holes in the map: %d files are damaged or missing, the last %s", len(damaged), damaged[-1])
         self._link.send_status_text(Severity.WARNING, f"OrthoLoC: {len(damaged)} map files damaged")
+
+
+def autopilot_record(now_ns: int, link: AutopilotLink, witness: WitnessReport, on_vision: bool) -> AutopilotRecord:
+    """What is published of the autopilot."""
+    fusion, advice = link.fusion, link.delay_advice
+    median_ms, p99_ms = link.latency_ms
+
+    def age_s(since_ns: int) -> float | None:
+        return (now_ns - since_ns) / _S if since_ns else None
+
+    return AutopilotRecord(
+        stamp_ns=now_ns,
+        connected=link.connected(),
+        fusion=fusion.state.value,
+        fusion_since_s=age_s(fusion.since_ns),
+        fusion_reason=fusion.reason,
+        gnss=witness.state.value,
+        gnss_since_s=age_s(witness.since_ns),
+        gnss_apart_m=witness.apart_m,
+        gnss_height_apart_m=witness.height_apart_m,
+        latency_median_ms=median_ms,
+        latency_p99_ms=p99_ms,
+        delay_advice=None if advice is None else str(advice),
+        on_vision=on_vision,
+    )
 
 
 def vision_estimate(

@@ -1,4 +1,5 @@
-"""Outcomes on zenoh: ``ortholoc/<vehicle>/fix`` and ``…/rejection`` as JSON, and a liveliness token ``…/alive``."""
+"""Outcomes on zenoh: ``ortholoc/<vehicle>/fix`` and ``…/rejection`` as JSON, ``…/autopilot`` about what became of the
+fixes there, and a liveliness token ``…/alive``."""
 
 from __future__ import annotations
 
@@ -37,6 +38,35 @@ class BusOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
 
 
+class AutopilotRecord(Struct, frozen=True, kw_only=True):
+    """What ``…/autopilot`` holds.
+
+    Attributes:
+        stamp_ns: now, monotonic clock. connected: whether its heart beats.
+        fusion: "fused", "ignored", "rejected" or "unknown": what its filter does with the fixes. fusion_since_s: for
+            how long; None if never otherwise. fusion_reason: probably why.
+        gnss: "ok", "suspect", "bad" or "unknown": whether GNSS agrees with the fixes. gnss_since_s: for how long.
+            gnss_apart_m: horizontal, at the last fix. gnss_height_apart_m: where heights differ by a constant that
+            looks like a datum's, by how much GNSS is higher.
+        latency_median_ms, latency_p99_ms: from mid-exposure to sent. delay_advice: parameters to set, for people.
+        on_vision: whether we commanded the source set of vision.
+    """
+
+    stamp_ns: int
+    connected: bool
+    fusion: str
+    fusion_since_s: float | None
+    fusion_reason: str
+    gnss: str
+    gnss_since_s: float | None
+    gnss_apart_m: float | None
+    gnss_height_apart_m: float | None
+    latency_median_ms: float | None
+    latency_p99_ms: float | None
+    delay_advice: str | None
+    on_vision: bool
+
+
 class Bus:
     """A zenoh session that publishes; never blocks the caller for a slow subscriber.
 
@@ -62,7 +92,7 @@ class Bus:
                     encoding=zenoh.Encoding.APPLICATION_JSON,
                     congestion_control=zenoh.CongestionControl.DROP,
                 )
-                for name in ("fix", "rejection")
+                for name in ("fix", "rejection", "autopilot")
             }
         except zenoh.ZError as err:
             self.close()
@@ -76,9 +106,15 @@ class Bus:
 
     def publish(self, outcome: Outcome) -> None:
         """Send an outcome to whoever listens. A failure is counted and logged, never raised: the flight goes on."""
-        name = "fix" if isinstance(outcome, Fix) else "rejection"
+        self._put("fix" if isinstance(outcome, Fix) else "rejection", outcome_record(outcome))
+
+    def publish_autopilot(self, record: AutopilotRecord) -> None:
+        """The same for what is known of the autopilot's use of the fixes."""
+        self._put("autopilot", record)
+
+    def _put(self, name: str, record: object) -> None:
         try:
-            self._publishers[name].put(msgspec.json.encode(outcome_record(outcome)))
+            self._publishers[name].put(msgspec.json.encode(record))
         except zenoh.ZError:
             self.dropped += 1
             logger.warning("zenoh: %s not published", name, exc_info=True)

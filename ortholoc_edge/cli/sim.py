@@ -37,6 +37,19 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--duration", type=positive, default=65.0, metavar="S", help="of the flight, at least 30 (default: %(default)s)"
     )
+    parser.add_argument(
+        "--release",
+        choices=("fast-forward", "fixed-latency", "raw"),
+        default="fast-forward",
+        help="how fixes are sent, as [link] release (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--viso-delay-ms",
+        type=positive,
+        metavar="MS",
+        help="have the autopilot take the time of a fix as ArduPilot does, by the least delay seen lately less this "
+        "(its VISO_DELAY_MS, at most 250), instead of by time synchronisation",
+    )
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     matcher_options.add(parser)
     parser.set_defaults(run=run)
@@ -45,6 +58,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     # Not at the top: every other command works without the simulation.
     from ortholoc_sim import demo_pack_path
+    from ortholoc_sim.autopilot import AutopilotOptions, FilterOptions
     from ortholoc_sim.flight import FlightOptions, draw_track, run_flight
 
     if args.duration < 30.0:
@@ -57,6 +71,12 @@ def run(args: argparse.Namespace) -> int:
         duration_s=args.duration,
         localizer=LocalizerOptions(adhop=not args.no_adhop),
         matcher=matcher_options.settings(args),
+        release=args.release,
+        autopilot=AutopilotOptions(
+            filter=FilterOptions()
+            if args.viso_delay_ms is None
+            else FilterOptions(stamps="jitter", viso_delay_ms=args.viso_delay_ms)
+        ),
     )
     done = threading.Event()
     ticker = threading.Thread(target=_show_time, args=(args.duration, done), daemon=True)
@@ -101,6 +121,7 @@ def _table(report: FlightReport, args: argparse.Namespace) -> str:
         ("latency from exposure", spread(report.latency_ms, "ms")),
         ("autopilot error", spread(report.autopilot_error_m, "m, horizontal, after GNSS was lost")),
         ("dead reckoning alone", "-" if end is None else f"{end:.1f} m off at the end"),
+        ("sent as", args.release),
         ("time of a fix", f"{report.autopilot_stamps} (see ortholoc_sim.autopilot.FilterOptions)"),
         ("autopilot's filter", ", ".join(f"{verdict} {count}" for verdict, count in report.vision.items() if count)),
         ("pictures", f"{args.out / 'track.png'}, figures in {args.out / 'summary.json'}"),

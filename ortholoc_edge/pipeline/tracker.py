@@ -17,6 +17,7 @@ from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.frame import CameraMount, VehicleState
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.prior import PosePrior
+from ortholoc_edge.pipeline.witness import Witness, WitnessOptions
 from ortholoc_edge.tiles.georeference import Georeference
 
 # Between GNSS and the chain of fixes, over position.
@@ -61,7 +62,11 @@ class _Anchor:
 
 
 class Tracker:
-    """Predicts a `PosePrior` for each frame and learns from its outcome; used by one thread."""
+    """Predicts a `PosePrior` for each frame and learns from its outcome; used by one thread.
+
+    Attributes:
+        witness: whether GNSS agrees with the fixes.
+    """
 
     def __init__(
         self,
@@ -69,13 +74,16 @@ class Tracker:
         body_from_camera: Rigid3 | None,
         options: TrackerOptions,
         first_reset_counter: int = 0,
+        witness: WitnessOptions | None = None,
     ) -> None:
         """
         Args:
             body_from_camera: of a fixed mount; None: a gimbal, whose attitude comes with each state.
             first_reset_counter: another one in every life of the program: an autopilot that has seen a value takes
                 it again as "no reset".
+            witness: of the test of GNSS against the fixes; None: as by default.
         """
+        self.witness = Witness(witness or WitnessOptions())
         self._georeference = georeference
         self._fixed_mount = None if body_from_camera is None else CameraMount(body_from_camera)
         self._options = options
@@ -92,6 +100,7 @@ class Tracker:
             return Rejected(
                 state.stamp_ns, Reason.BAD_ATTITUDE, "no finite attitude from the autopilot at the exposure"
             )
+        self.witness.tick(state.stamp_ns)
         self._take_absolute(state)
         mount = self.mount(state)
         if mount is None:
@@ -143,6 +152,9 @@ class Tracker:
         lever = body.translation - outcome.map_from_camera.translation
         covariance = cov.of_moved_point(outcome.covariance, lever)
         self._anchor = _anchor(state, body.translation, covariance[:3, :3], from_fix=True)
+        if state.position_map_m is not None:
+            both = covariance[:2, :2] + np.eye(2) * state.position_sigma_m[0] ** 2
+            self.witness.compare(state.stamp_ns, state.position_map_m - body.translation, both)
         self.status = TrackerStatus.TRACK
 
     def _jumped(self, fix: Fix) -> bool:
@@ -189,9 +201,12 @@ class Tracker:
 
         It is kept as an anchor, so that there is something to carry on when GNSS ends before the first fix. One
         that contradicts the chain of fixes is left alone: a spoofed receiver must not switch the camera off. The
-        chain's own uncertainty grows until the two agree, if it was the chain that was wrong.
+        chain's own uncertainty grows until the two agree, if it was the chain that was wrong. Nor is any taken while
+        the witness says that GNSS contradicts the fixes: that lasts when the chain has ended.
         """
         position, sigma_m = state.position_map_m, state.position_sigma_m
+        if not self.witness.trusted:
+            return
         # A NaN sigma would pass for the most certain position of all.
         if position is None or not (np.isfinite(position).all() and np.isfinite(sigma_m).all()):
             return

@@ -109,9 +109,7 @@ class FilterOptions:
         stamps: how a measurement's capture time is had. "timesync", the default, is not what ArduPilot does: it
             answers TIMESYNC but stamps external navigation by the least delay seen lately (contract 2.6), which is
             "jitter". So "timesync" judges the fixes and our protocol, "jitter" what an untuned vehicle would make of
-            them. Measured in one flight each, horizontal error of the autopilot after GNSS was lost: timesync 0.52 m
-            median, 1.18 m at most; jitter with VISO_DELAY_MS 250 (the most there is) at a latency of 474 ms 2.35 m
-            and 3.90 m. Those were with less drift than the default has now.
+            them. What each way of sending comes to: docs/release.md.
     """
 
     pos_m_nse: float = 0.2

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import msgspec
@@ -81,6 +81,7 @@ class FlightOptions:
         frame_rate_hz: of the camera.
         camera, mount: the one on board; where ``mount`` names a gimbal it is in ``autopilot.gimbal``.
         seed: of sensor errors, wind and noise.
+        release: how the daemon sends fixes, see `LinkOptions.release`.
         matcher, localizer, timing: of the daemon. Fixes may be older than its default allows: the simulated autopilot
             applies them where their stamps say, and a busy computer draws the camera's pictures too.
     """
@@ -109,6 +110,7 @@ class FlightOptions:
     matcher: MatcherOptions = field(default_factory=MatcherOptions)
     localizer: LocalizerOptions = field(default_factory=LocalizerOptions)
     timing: TimingOptions = field(default_factory=lambda: TimingOptions(max_age_ms=5000.0))
+    release: Literal["fast-forward", "fixed-latency", "raw"] = "fast-forward"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -328,7 +330,10 @@ class SimulatedCamera:
 
 
 def daemon_under_test(
-    matcher: MatcherOptions, localizer: LocalizerOptions, timing: TimingOptions
+    matcher: MatcherOptions,
+    localizer: LocalizerOptions,
+    timing: TimingOptions,
+    release: Literal["fast-forward", "fixed-latency", "raw"] = "fast-forward",
 ) -> UnderTest:
     """The real daemon, in this process, configured for the bench's camera, pack and autopilot."""
 
@@ -341,7 +346,7 @@ def daemon_under_test(
                 cy=camera.cy, distortion=camera.distortion,
             ),
             map=MapOptions(pack=str(bench.pack)),
-            link=LinkOptions(endpoint=bench.endpoint),
+            link=LinkOptions(endpoint=bench.endpoint, release=release),
             mount=bench.mount,
             matcher=matcher,
             localizer=localizer,
@@ -365,7 +370,7 @@ def run_flight(options: FlightOptions, under_test: UnderTest | None = None, cloc
     clock = clock or SystemClock()
     path = options.pack or demo_pack_path()
     pack = Pack.open(path)
-    site, route = _site_and_route(pack, options)
+    site, route = site_and_route(pack, options)
     placement = _placement(pack, site, options.spec)
     loop_holder: list[ClosedLoop] = []
 
@@ -382,7 +387,8 @@ def run_flight(options: FlightOptions, under_test: UnderTest | None = None, cloc
     port = UdpPort(options.autopilot.system_id)
     try:
         # The world is made in the camera's process meanwhile.
-        run = (under_test or daemon_under_test(options.matcher, options.localizer, options.timing))(
+        companion = daemon_under_test(options.matcher, options.localizer, options.timing, options.release)
+        run = (under_test or companion)(
             Bench(
                 path, options.camera, options.mount, camera, f"udpout:127.0.0.1:{port.port}", stop,
                 lambda outcome: outcomes.append((clock.now_ns(), outcome)),
@@ -454,7 +460,7 @@ def _fly(
         stop.set()
 
 
-def _site_and_route(pack: Pack, options: FlightOptions) -> tuple[Site, FloatArray]:
+def site_and_route(pack: Pack, options: FlightOptions) -> tuple[Site, FloatArray]:
     with MapStore(pack) as store:
         xy = np.array(options.route_m, dtype=np.float64) + np.array([DEMO_WEST_M, DEMO_SOUTH_M])
         # Trees and roofs lift the mean, not the median.

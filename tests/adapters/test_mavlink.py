@@ -823,7 +823,8 @@ def pair(request):
     else:
         wire = PtyWire()
         endpoint = f"serial:{wire.path}:921600"
-    return AutopilotLink(LinkOptions(endpoint=endpoint), SystemClock()), FakeAutopilot(wire)
+    # Each fix once, as it is: what is carried on is tested beside `Release`.
+    return AutopilotLink(LinkOptions(endpoint=endpoint, release="raw"), SystemClock()), FakeAutopilot(wire)
 
 
 def test_flight_over_a_real_wire(pair):
@@ -857,6 +858,49 @@ def test_flight_over_a_real_wire(pair):
 
 
 @pytest.mark.parametrize("kind", ["udp", "serial"])
+def test_fast_forward_over_a_real_wire(kind):
+    """One fix, 0.3 s old: several estimates, each where the vehicle is at its stamp, until the second is over."""
+    wire = UdpWire() if kind == "udp" else PtyWire()
+    endpoint = f"udpout:127.0.0.1:{wire.port}" if kind == "udp" else f"serial:{wire.path}:921600"
+    autopilot = FakeAutopilot(wire)
+    link = AutopilotLink(LinkOptions(endpoint=endpoint), SystemClock())
+    with flying(link, autopilot):
+        wait_for(lambda: good_state(link))
+
+        def at(stamp_ns):
+            return 5.0 * (stamp_ns - autopilot.boot_ns) / S
+
+        wait_for(lambda: (state := link.state_at(time.monotonic_ns() - 300 * MS)) and state.odometry_ned_m is not None)
+        capture = time.monotonic_ns() - 300 * MS
+        link.send_estimate(estimate(capture, north=at(capture)))
+        wait_for(lambda: link.statistics().get("release.repeats_ended") == 1, 20.0)
+        sent = [m for m in autopilot.got if m.get_type() == "ODOMETRY"]
+        assert len(sent) >= 3
+        for message in sent:
+            assert message.time_usec > capture // 1000
+            # Clocks are related to 5 ms, which are 3 cm at 5 m/s; and a stamp of telemetry is of whole ms.
+            assert message.x == pytest.approx(at(message.time_usec * 1000), abs=0.1)
+            assert (message.y, message.z) == pytest.approx((2.0, -3.0), abs=1e-3)
+        assert [m.time_usec for m in sent] == sorted({m.time_usec for m in sent})
+        statistics = link.statistics()
+        assert statistics["release.carried"] == 1 and statistics["release.repeated"] == len(sent) - 1
+        assert statistics["latency_median_ms"] >= 300.0
+        assert "VISO_DELAY_MS" in statistics["delay_advice"]
+
+
+def test_source_set_is_commanded_until_acknowledged(caplog):
+    script = Script()
+    script.hear(heartbeat())
+    script.protocol.source_set.ask(2)
+    script.run(2.5)
+    assert script.commands(42007) == [2, 2, 2]
+    script.hear(dialect.MAVLink_command_ack_message(42007, dialect.MAV_RESULT_DENIED))
+    script.run(5.0)
+    assert script.commands(42007) == [2, 2, 2]
+    assert "refuses to take EKF source set 2" in caplog.text
+
+
+@pytest.mark.parametrize("kind", ["udp", "serial"])
 def test_hostile_bytes_and_half_frames(kind):
     if kind == "udp":
         port = free_udp_port()
@@ -866,7 +910,7 @@ def test_hostile_bytes_and_half_frames(kind):
         endpoint = f"serial:{wire.path}:921600"
     autopilot = FakeAutopilot(wire)
     autopilot.noise_probability, autopilot.halve_probability = 0.3, 0.1
-    link = AutopilotLink(LinkOptions(endpoint=endpoint), SystemClock())
+    link = AutopilotLink(LinkOptions(endpoint=endpoint, release="raw"), SystemClock())
     with flying(link, autopilot):
         check_attitude(wait_for(lambda: good_state(link, back_ms=400)), autopilot)
         if kind == "udp":
@@ -895,7 +939,7 @@ def test_hostile_bytes_and_half_frames(kind):
 def test_nan_attitude_reboot_and_jump_in_flight():
     wire = UdpWire()
     autopilot = FakeAutopilot(wire)
-    link = AutopilotLink(LinkOptions(endpoint=f"udpout:127.0.0.1:{wire.port}"), SystemClock())
+    link = AutopilotLink(LinkOptions(endpoint=f"udpout:127.0.0.1:{wire.port}", release="raw"), SystemClock())
     with flying(link, autopilot):
         first = wait_for(lambda: good_state(link))
         autopilot.nan_attitude = True
@@ -920,7 +964,7 @@ def test_nan_attitude_reboot_and_jump_in_flight():
 def test_tcp_comes_back_after_the_peer_hung_up():
     wire = TcpWire()
     autopilot = FakeAutopilot(wire)
-    link = AutopilotLink(LinkOptions(endpoint=f"tcp:127.0.0.1:{wire.port}"), SystemClock())
+    link = AutopilotLink(LinkOptions(endpoint=f"tcp:127.0.0.1:{wire.port}", release="raw"), SystemClock())
     with flying(link, autopilot):
         wait_for(lambda: good_state(link))
         wire.drop()
@@ -934,7 +978,7 @@ def test_serial_line_pulled_out_and_put_back(tmp_path):
     device = tmp_path / "ttyVEHICLE"
     device.symlink_to(wire.path)
     autopilot = FakeAutopilot(wire)
-    link = AutopilotLink(LinkOptions(endpoint=f"serial:{device}:921600"), SystemClock())
+    link = AutopilotLink(LinkOptions(endpoint=f"serial:{device}:921600", release="raw"), SystemClock())
     link.start()
     try:
         wait_for(lambda: good_state(link))
@@ -973,7 +1017,7 @@ def test_latest_estimate_wins_on_a_choked_line():
     slot."""
     wire = PtyWire()
     autopilot = FakeAutopilot(wire)
-    link = AutopilotLink(LinkOptions(endpoint=f"serial:{wire.path}:921600"), SystemClock())
+    link = AutopilotLink(LinkOptions(endpoint=f"serial:{wire.path}:921600", release="raw"), SystemClock())
     link.start()
     try:
         wait_for(lambda: good_state(link))

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from ortholoc_edge.adapters.bus import Bus, BusOptions
+from ortholoc_edge.adapters.bus import AutopilotRecord, Bus, BusOptions
 from ortholoc_edge.errors import ConfigError, LinkError
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.rigid import Rigid3
@@ -94,6 +94,28 @@ def test_fix_and_rejection_arrive(bus: Bus, listener: Any) -> None:
     assert record["stamp_ns"] == 10**9
     assert (record["reason"], record["detail"]) == ("map_nodata", "nothing there")
     assert (record["measured"], record["limit"]) == (0.0, 1.0)
+    subscriber.undeclare()
+
+
+def test_what_became_of_the_fixes_arrives(bus: Bus, listener: Any) -> None:
+    got: queue.Queue[dict[str, Any]] = queue.Queue()
+    subscriber = listener.declare_subscriber(
+        "ortholoc/hawk/autopilot", lambda sample: got.put(json.loads(sample.payload.to_bytes()))
+    )
+    record = AutopilotRecord(
+        stamp_ns=5, connected=True, fusion="ignored", fusion_since_s=2.5, fusion_reason="why", gnss="bad",
+        gnss_since_s=None, gnss_apart_m=12.0, gnss_height_apart_m=None, latency_median_ms=300.0, latency_p99_ms=450.0,
+        delay_advice="VISO_DELAY_MS = 4", on_vision=False,
+    )  # fmt: skip
+    for _ in range(200):
+        bus.publish_autopilot(record)
+        try:
+            assert got.get(timeout=0.1) == msgspec.to_builtins(record)
+            break
+        except queue.Empty:
+            continue
+    else:
+        raise AssertionError("nothing arrived")
     subscriber.undeclare()
 
 

@@ -39,6 +39,7 @@ from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.navigator import TimingOptions
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
+from ortholoc_edge.pipeline.witness import WitnessOptions
 from ortholoc_edge.tiles.georeference import Georeference
 
 ROLL, PITCH, YAW = 3.0, -4.0, 30.0
@@ -103,7 +104,7 @@ def config(source: str, endpoint: str, **more: Any) -> Config:
             width_px=camera.width, height_px=camera.height, fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy
         ),
         map=MapOptions(pack=str(rendered.store().pack.path)),
-        link=LinkOptions(endpoint=endpoint, send=("odometry", "vision_position_estimate")),
+        link=LinkOptions(endpoint=endpoint, send=("odometry", "vision_position_estimate"), release="raw"),
         matcher=MatcherOptions(name="sift", max_keypoints=2048),
         **more,
     )
@@ -360,6 +361,56 @@ def test_a_moved_origin_raises_the_reset_counter(folder: Path) -> None:
     # A thousandth of a degree to the north.
     assert before.x - after.x == pytest.approx(111.2, abs=3.0)
     assert after.reset_counter == (before.reset_counter + 1) % 256
+
+
+class _SpoofedAutopilot(HoveringAutopilot):
+    """Its GNSS is ``beside_m`` to the north; keeps commands for the EKF's source set."""
+
+    def __init__(self, wire: Wire) -> None:
+        self.beside_m = 0.0
+        self.source_sets: list[int] = []
+        super().__init__(wire)
+
+    def _stream(self, message_id: int, now_ns: int) -> Any:
+        message = super()._stream(message_id, now_ns)
+        if message_id == dialect.MAVLINK_MSG_ID_GPS_RAW_INT:
+            message.lat += round(self.beside_m / 111_320.0 * 1e7)
+        return message
+
+    def _take(self, message: Any) -> None:
+        if message.get_type() == "COMMAND_LONG" and message.command == dialect.MAV_CMD_SET_EKF_SOURCE_SET:
+            self.source_sets.append(round(message.param1))
+        super()._take(message)
+
+
+def test_spoofed_gnss_is_told_and_the_source_switched_where_enabled(folder: Path) -> None:
+    wire = UdpWire()
+    autopilot = _SpoofedAutopilot(wire)
+    base = config(
+        f"folder:{folder}", f"udpout:127.0.0.1:{wire.port}",
+        # Fewer frames than in flight: it is the same with its own limits (tests/pipeline/test_witness.py).
+        witness=WitnessOptions(suspect_score=2.0, bad_score=10.0),
+    )  # fmt: skip
+    enabled = msgspec.structs.replace(
+        base,
+        camera=CameraOptions(source=f"folder:{folder}", rate_hz=2.0),
+        link=msgspec.structs.replace(base.link, switch_sources=True, vision_source_set=3),
+    )
+    daemon = Daemon(enabled)
+    try:
+        with running(daemon):
+            wait_for(lambda: autopilot.messages("ODOMETRY"), "an estimate")
+            assert daemon.statistics()["gnss_consistency"] in ("unknown", "ok")
+            autopilot.beside_m = 40.0
+            wait_for(lambda: daemon.statistics()["gnss_consistency"] == "bad", "GNSS found bad", 40.0)
+            wait_for(lambda: autopilot.source_sets, "a command")
+            texts = [str(message.text) for message in autopilot.messages("STATUSTEXT")]
+            wait_for(lambda: any("GNSS contradicts camera" in str(m.text) for m in autopilot.messages("STATUSTEXT")),
+                     f"a word about it, not {texts}")  # fmt: skip
+            assert daemon.statistics()["fixes"] > 0
+            assert set(autopilot.source_sets) == {3}
+    finally:
+        autopilot.close()
 
 
 def automatic(folder: Path, wire: UdpWire, **link: Any) -> Config:

@@ -14,6 +14,7 @@ from ortholoc_edge.pipeline.frame import VehicleState
 from ortholoc_edge.pipeline.outcome import Reason, Rejected
 from ortholoc_edge.pipeline.prior import PosePrior
 from ortholoc_edge.pipeline.tracker import Tracker, TrackerOptions, TrackerStatus
+from ortholoc_edge.pipeline.witness import Consistency
 from ortholoc_edge.tiles.georeference import Georeference, VerticalDatum
 
 LOCAL = Georeference(None, VerticalDatum(kind="ellipsoid", ellipsoid_minus_map_m=0.0), (0.0, 0.0))
@@ -305,6 +306,32 @@ def test_gnss_comes_back_when_the_chain_has_grown_unsure():
     made = fixed(odometry_drift_m_per_s=1.0)
     prior = made.predict(state(40, (0, 0, 0), position=(60.0, 0, 100), sigma=(1.5, 2.5)))
     assert np.allclose(prior.map_from_camera.translation, (60, 0, 100))
+
+
+def test_a_spoof_ramp_is_witnessed_and_then_steers_nothing():
+    """1 m/s, while the vehicle stands still; when the fixes end too, GNSS is not where to look next."""
+    made = fixed()
+    for second in range(1, 40):
+        here = state(second, (0, 0, 0), position=(float(max(second - 10, 0)), 0, 100), sigma=(1.5, 2.5))
+        prior = made.predict(here)
+        assert np.linalg.norm(prior.map_from_camera.translation[:2]) < 1.0
+        made.update(fix((0.0, 0.0, 100.0), stamp_ns=second * SECOND), here)
+        if second == 10:
+            assert made.witness.report.state is Consistency.OK
+    assert made.witness.report.state is Consistency.BAD
+    assert 10 * SECOND < made.witness.report.since_ns < 25 * SECOND
+    # Without odometry the chain grows by 15 m/s: GNSS would soon be the surer of the two.
+    for second in range(40, 60):
+        outcome = made.predict(state(second, position=(second - 10.0, 0, 100), sigma=(1.5, 2.5)))
+        if isinstance(outcome, Rejected):
+            assert outcome.reason is Reason.NO_PRIOR
+            break
+        assert np.linalg.norm(outcome.map_from_camera.translation[:2]) < 1.0
+    else:
+        raise AssertionError("the chain should have ended")
+    # A minute without anything to compare: there is no better guess, and it has to match the map.
+    again = made.predict(state(110, position=(100.0, 0, 100), sigma=(1.5, 2.5)))
+    assert np.allclose(again.map_from_camera.translation, (100, 0, 100))
 
 
 def test_another_life_begins_with_another_reset_counter():

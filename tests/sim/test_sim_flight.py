@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from ortholoc_sim import demo_pack_path
-from ortholoc_sim.autopilot import AutopilotOptions, GimbalOptions, SensorOptions, Verdict, dialect
+from ortholoc_sim.autopilot import AutopilotOptions, FilterOptions, GimbalOptions, SensorOptions, Verdict, dialect
 from ortholoc_sim.flight import Bench, FlightOptions, draw_track, make_report, run_flight
 from ortholoc_sim.loop import ClosedLoop, LoopOptions
 from ortholoc_sim.site import Site
@@ -22,6 +22,7 @@ from ortholoc_edge.adapters.camera import EndOfFrames
 from ortholoc_edge.adapters.mavlink import GimbalSelection, LinkOptions
 from ortholoc_edge.adapters.mavlink.codec import FrameParser
 from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate
+from ortholoc_edge.adapters.mavlink.monitor import Fusion
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import FloatArray
@@ -38,13 +39,17 @@ def route(site: Site) -> FloatArray:
     return np.column_stack([corners + site.anchor_map_m[:2], np.full(5, site.anchor_map_m[2] + 90.0)])
 
 
-def flown(site: Site, seconds: float, *, estimates: bool, seed: int = 1, noise_m: float = 0.8) -> ClosedLoop:
+def flown(
+    site: Site, seconds: float, *, estimates: bool, seed: int = 1, noise_m: float = 0.8, latency_s: float = 0.4,
+    release: str = "raw", position_filter: FilterOptions | None = None,
+) -> tuple[ClosedLoop, LinkProtocol]:  # fmt: skip
     """Fly faster than real time against the daemon's own protocol, every message packed and parsed.
 
-    Estimates are the truth 0.4 s ago with noise, at 2 Hz.
+    Fixes are the truth ``latency_s`` ago with noise, at 2 Hz.
     """
-    loop = ClosedLoop(site, LoopOptions(route(site), seed=seed), START)
-    protocol = LinkProtocol(LinkOptions(endpoint="udp:127.0.0.1:1"))
+    autopilot = AutopilotOptions(filter=position_filter or FilterOptions())
+    loop = ClosedLoop(site, LoopOptions(route(site), seed=seed, autopilot=autopilot), START)
+    protocol = LinkProtocol(LinkOptions(endpoint="udp:127.0.0.1:1", release=release))
     ours, theirs = dialect.MAVLink(None, 1, 197), dialect.MAVLink(None, 1, 1)
     from_autopilot, from_us = FrameParser(), FrameParser()
     rng = np.random.default_rng(seed)
@@ -58,18 +63,21 @@ def flown(site: Site, seconds: float, *, estimates: bool, seed: int = 1, noise_m
             for answer in protocol.on_message(message, now)
         ]
         replies += protocol.poll(now)
-        taken = now - round(0.4 * S)
+        taken = now - round(latency_s * S)
         truth = loop.truth_at(taken)
         if estimates and tick % 25 == 0 and truth is not None:
             position = site.autopilot_from_ned(truth.position_ned_m) + rng.normal(0.0, noise_m, 3)
-            replies += protocol.encode_estimate(
-                VisionEstimate(taken, position, truth.ned_from_body, np.diag([noise_m**2] * 3 + [1e-4] * 3)), now
-            )
+            fix = VisionEstimate(taken, position, truth.ned_from_body, np.diag([noise_m**2] * 3 + [1e-4] * 3))
+            protocol.release.take(fix, now, protocol.state_at)
+        outgoing = protocol.release.due(now, protocol.state_at)
+        if outgoing is not None:
+            replies += protocol.encode_estimate(outgoing.estimate, now)
+            protocol.sent(outgoing, now)
         for reply in replies:
             for answer in loop.receive(from_us.feed(reply.pack(ours), now), now):
                 for message in from_autopilot.feed(answer.pack(theirs), now):
                     protocol.on_message(message, now)
-    return loop
+    return loop, protocol
 
 
 def errors_after(loop: ClosedLoop) -> FloatArray:
@@ -86,7 +94,7 @@ def off_route(loop: ClosedLoop, site: Site) -> FloatArray:
 
 
 def test_estimates_keep_it_on_its_route(site: Site) -> None:
-    loop = flown(site, 65.0, estimates=True)
+    loop, _ = flown(site, 65.0, estimates=True)
     assert errors_after(loop).max() < 3.0
     # Corners are cut; that is flying, not drifting.
     assert np.percentile(off_route(loop, site), 85) < 5.0
@@ -95,8 +103,34 @@ def test_estimates_keep_it_on_its_route(site: Site) -> None:
     assert flown_m > 250
 
 
+def test_as_ardupilot_stamps_only_fast_forward_holds_it(site: Site) -> None:
+    """By the least delay seen lately, less VISO_DELAY_MS of at most 250: half a second of latency is beyond it."""
+
+    def error_m(release: str, viso_delay_ms: float) -> tuple[float, LinkProtocol]:
+        stamps = FilterOptions(stamps="jitter", viso_delay_ms=viso_delay_ms)
+        loop, protocol = flown(site, 50.0, estimates=True, latency_s=0.5, release=release, position_filter=stamps)
+        return float(np.median(errors_after(loop))), protocol
+
+    carried_m, protocol = error_m("fast-forward", 0.0)
+    raw_m, _ = error_m("raw", 250.0)
+    assert carried_m < 0.9
+    assert raw_m > 2.0 * carried_m
+    assert protocol.release.displacement_trusted
+    assert protocol.fusion.state is Fusion.FUSED
+    advice = protocol.delay_advice()
+    assert advice is not None and advice.viso_delay_ms == 0
+
+
+def test_the_monitor_tells_standby_from_fused(site: Site) -> None:
+    """While GNSS is in use nothing shows whose the position is; after it, the position is at the fixes."""
+    _, protocol = flown(site, 9.5, estimates=True, release="fast-forward")
+    assert protocol.fusion.state is Fusion.UNKNOWN
+    _, protocol = flown(site, 25.0, estimates=True, release="fast-forward")
+    assert protocol.fusion.state is Fusion.FUSED
+
+
 def test_without_estimates_it_drifts_off(site: Site) -> None:
-    worst = [float(errors_after(flown(site, 65.0, estimates=False, seed=seed))[-1]) for seed in (1, 2)]
+    worst = [float(errors_after(flown(site, 65.0, estimates=False, seed=seed)[0])[-1]) for seed in (1, 2)]
     # As far as an autopilot without velocity aiding drifts in 55 s.
     assert max(worst) < 80.0
     assert min(worst) > 15.0
@@ -139,7 +173,7 @@ def test_a_gimbal_on_a_moving_vehicle_is_known_at_the_exposure(site: Site) -> No
 
 
 def test_same_seed_same_flight(site: Site) -> None:
-    first, second = (flown(site, 8.0, estimates=True) for _ in range(2))
+    first, second = (flown(site, 8.0, estimates=True)[0] for _ in range(2))
     assert np.array_equal(first.samples[-1].truth.position_ned_m, second.samples[-1].truth.position_ned_m)
     assert np.array_equal(first.samples[-1].estimate_m, second.samples[-1].estimate_m)
 
@@ -191,7 +225,7 @@ def true_fix(loop: ClosedLoop, site: Site, options: FlightOptions, stamp_ns: int
 
 def test_report_reads_errors_as_they_are(site: Site, tmp_path: Path) -> None:
     options = FlightOptions()
-    loop = flown(site, 35.0, estimates=True)
+    loop, _ = flown(site, 35.0, estimates=True)
     stamps = range(START + 3 * S, START + 34 * S, S // 2)
     outcomes: list[tuple[int, Outcome]] = [
         (stamp + S // 4, true_fix(loop, site, options, stamp, 1.0)) for stamp in stamps
@@ -224,11 +258,11 @@ def test_a_flight_that_the_fixes_did_not_hold_fails(site: Site) -> None:
         outcomes: list[tuple[int, Outcome]] = [(t + S // 4, true_fix(loop, site, options, t)) for t in stamps]
         return " | ".join(make_report(loop, site, options, outcomes, 60).problems)
 
-    mute = problems(flown(site, 35.0, estimates=False))
+    mute = problems(flown(site, 35.0, estimates=False)[0])
     assert "took in 0 of" in mute
     assert "none arrived" in mute
     assert "dead reckoning alone" in mute
-    held = flown(site, 35.0, estimates=True)
+    held, _ = flown(site, 35.0, estimates=True)
     assert problems(held) == ""
     refused = [replace(r, verdict=Verdict.GATED) if i % 2 else r for i, r in enumerate(held.autopilot.vision)]
     held.autopilot.vision[:] = refused

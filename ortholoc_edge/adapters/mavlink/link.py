@@ -17,7 +17,9 @@ from ortholoc_edge.adapters.mavlink.codec import FrameParser, MavlinkMessage, di
 from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate
 from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin
 from ortholoc_edge.adapters.mavlink.gimbal import GimbalSelection
+from ortholoc_edge.adapters.mavlink.latency import DelayAdvice
 from ortholoc_edge.adapters.mavlink.log import LimitedLog
+from ortholoc_edge.adapters.mavlink.monitor import FusionReport
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus, parse_endpoint
 from ortholoc_edge.adapters.mavlink.parameters import Number, Reading, Written
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol, Statistic
@@ -62,7 +64,6 @@ class AutopilotLink:
         self._thread: threading.Thread | None = None
         self._transport: Transport | None = None
         self._wake_pair: tuple[socket.socket, socket.socket] | None = None
-        self._estimate: VisionEstimate | None = None
         self._recovery = False
         self._texts: deque[MavlinkMessage] = deque(maxlen=16)
         self._text_id = 0
@@ -154,17 +155,49 @@ class AutopilotLink:
             return self._protocol.sinks
 
     def send_estimate(self, estimate: VisionEstimate, recovery: bool = False) -> None:
-        """Hand an estimate over. One that was not sent yet is replaced and counted: newer is better.
+        """Hand a fix over; when and how often it goes out is ``options.release``'s. One that was not sent yet is
+        replaced and counted: newer is better.
 
         Args:
             recovery: the first one after an outage; told as such with the next that is sent, if
                 ``options.recovery`` allows it.
         """
         with self._lock:
-            if self._estimate is not None:
-                self._counts["estimates_dropped"] += 1
-            self._estimate = estimate
+            self._counts["estimates_dropped"] += self._protocol.release.take(
+                estimate, self._clock.now_ns(), self._protocol.state_at
+            )
             self._recovery |= recovery
+        self._wake()
+
+    @property
+    def fusion(self) -> FusionReport:
+        """What the autopilot's filter does with our fixes."""
+        with self._lock:
+            return self._protocol.fusion
+
+    @property
+    def delay_advice(self) -> DelayAdvice | None:
+        """The delay parameters that the measured latency asks for; None before a fix was sent."""
+        with self._lock:
+            return self._protocol.delay_advice()
+
+    @property
+    def restarts(self) -> int:
+        """How often the autopilot restarted, or another took its place."""
+        with self._lock:
+            return self._protocol.counts["restarts"]
+
+    @property
+    def latency_ms(self) -> tuple[float | None, float | None]:
+        """Median and 99th percentile from mid-exposure to sent; None before a fix was."""
+        with self._lock:
+            meter = self._protocol.latency
+            return meter.percentile_ms(50.0), meter.percentile_ms(99.0)
+
+    def take_source_set(self, number: int) -> None:
+        """Command an ArduPilot to use a source set; repeated until it answers."""
+        with self._lock:
+            self._protocol.source_set.ask(number)
         self._wake()
 
     def send_status_text(self, severity: Severity, text: str) -> None:
@@ -315,7 +348,7 @@ class AutopilotLink:
         while not self._stop.is_set():
             writers = [transport] if transport.pending() else []
             readers: list[Transport | socket.socket] = [transport, wake_receiver]
-            readable, writable, _ = select.select(readers, writers, [], _SELECT_TIMEOUT_S)
+            readable, writable, _ = select.select(readers, writers, [], self._wait_s())
             if wake_receiver in readable:
                 with contextlib.suppress(BlockingIOError):
                     wake_receiver.recv(4096)
@@ -345,6 +378,16 @@ class AutopilotLink:
                 if errors_in_a_row >= _GIVE_UP_AFTER_ERRORS:
                     raise
                 logger.exception("autopilot link: one item was left out")
+
+    def _wait_s(self) -> float:
+        """Until something is due, and never long."""
+        with self._lock:
+            next_ns = self._protocol.release.next_ns()
+        if next_ns is None:
+            return _SELECT_TIMEOUT_S
+        left_s = (next_ns - self._clock.now_ns()) / _S
+        # What was due before waits for the line, which select tells of; a loop without a pause would not help it.
+        return _SELECT_TIMEOUT_S if left_s <= 0.0 else min(left_s, _SELECT_TIMEOUT_S)
 
     def _take(self, transport: Transport, data: bytes, peer: Any, now_ns: int) -> None:
         with self._lock:
@@ -377,15 +420,17 @@ class AutopilotLink:
         now_ns = self._clock.now_ns()
         with self._lock:
             messages = self._protocol.poll(now_ns)
-            # While bytes wait, an estimate stays in its slot, where a newer one can still replace it.
-            if self._estimate is not None and not transport.pending():
-                estimate, self._estimate = self._estimate, None
+            # While bytes wait, an estimate stays where a newer one can still replace it.
+            look = self._protocol.state_at
+            outgoing = None if transport.pending() else self._protocol.release.due(now_ns, look)
+            if outgoing is not None:
                 encoded = []
                 if self._protocol.connected(now_ns):
                     wall_ns = wall_clock_ns()
-                    encoded = self._protocol.encode_estimate(estimate, now_ns, wall_ns, self._recovery)
+                    encoded = self._protocol.encode_estimate(outgoing.estimate, now_ns, wall_ns, self._recovery)
                 if encoded:
                     self._recovery = False
+                    self._protocol.sent(outgoing, now_ns)
                 else:
                     self._counts["estimates_dropped"] += 1
                 messages = encoded + messages

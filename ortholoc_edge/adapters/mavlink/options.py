@@ -49,6 +49,13 @@ class LinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         attitude_rate_hz, position_rate_hz: of ATTITUDE_QUATERNION and LOCAL_POSITION_NED, asked of the
             autopilot.
         set_origin: whether `AutopilotLink.offer_origin` may set the EKF origin of an autopilot that has none.
+        release: how fixes go out (`release`): carried on to the moment of sending, several times each; each once at
+            the same age; or each once as soon as it is there.
+        estimate_rate_hz: of "fast-forward"; 0 is the same as "raw". max_repeat_s: how long it goes on without a new
+            fix.
+        fixed_latency_ms: the age of "fixed-latency".
+        switch_sources: whether we may tell ArduPilot to take another source set (MAV_CMD_SET_EKF_SOURCE_SET) when
+            GNSS contradicts vision, and back. vision_source_set, gnss_source_set: n of EK3_SRCn_*.
     """
 
     endpoint: str
@@ -63,8 +70,19 @@ class LinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     attitude_rate_hz: Annotated[float, msgspec.Meta(ge=1, le=400)] = 50.0
     position_rate_hz: Annotated[float, msgspec.Meta(ge=1, le=100)] = 20.0
     set_origin: bool = False
+    release: Literal["fast-forward", "fixed-latency", "raw"] = "fast-forward"
+    estimate_rate_hz: Annotated[float, msgspec.Meta(ge=0, le=50)] = 10.0
+    max_repeat_s: Annotated[float, msgspec.Meta(gt=0, le=5)] = 1.0
+    fixed_latency_ms: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 250.0
+    switch_sources: bool = False
+    vision_source_set: Annotated[int, msgspec.Meta(ge=1, le=3)] = 2
+    gnss_source_set: Annotated[int, msgspec.Meta(ge=1, le=3)] = 1
 
     def __post_init__(self) -> None:
+        if self.switch_sources and self.vision_source_set == self.gnss_source_set:
+            raise ValueError(
+                f"vision_source_set and gnss_source_set are both {self.vision_source_set}; switch_sources needs two"
+            )
         if "auto" in self.send and len(self.send) > 1:
             raise ValueError(f"send = {list(self.send)} mixes auto with names; write either [\"auto\"] or the names")
         if len(set(self.send)) < len(self.send):

@@ -11,11 +11,15 @@ from ortholoc_edge.adapters.mavlink.codec import MavlinkMessage, dialect
 from ortholoc_edge.adapters.mavlink.estimates import Autopilot, VisionEstimate
 from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin
 from ortholoc_edge.adapters.mavlink.gimbal import GimbalSelection
+from ortholoc_edge.adapters.mavlink.latency import DelayAdvice, LatencyMeter, advise
 from ortholoc_edge.adapters.mavlink.log import LimitedLog
+from ortholoc_edge.adapters.mavlink.monitor import FusionMonitor, FusionReport
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus
 from ortholoc_edge.adapters.mavlink.outlet import Outlet
 from ortholoc_edge.adapters.mavlink.parameters import ParameterClient
+from ortholoc_edge.adapters.mavlink.release import Outgoing, Release
 from ortholoc_edge.adapters.mavlink.sinks import Sink
+from ortholoc_edge.adapters.mavlink.sources import PendingSwitch
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity, AutopilotState
 from ortholoc_edge.adapters.mavlink.streams import Repeat, Stream
 from ortholoc_edge.adapters.mavlink.telemetry import Telemetry
@@ -56,6 +60,11 @@ class LinkProtocol:
         self.telemetry = Telemetry(
             self.timesync, self.counts, options.attitude_rate_hz, options.position_rate_hz, gimbal
         )
+        self.release = Release(options)
+        self.latency = LatencyMeter()
+        self.monitor = FusionMonitor()
+        self.source_set = PendingSwitch()
+        self._advice: DelayAdvice | None = None
         self.parameters = ParameterClient()
         self._census = Census()
         self._vehicle: AutopilotIdentity | None = None
@@ -69,6 +78,8 @@ class LinkProtocol:
         self._origin_timer = Repeat(1 * _S)
         self._origin_watch_timer = Repeat(5 * _S)
         self._home_timer = Repeat(2 * _S, 10 * _S)
+        self._monitor_timer = Repeat(_S // 2)
+        self._advice_timer = Repeat(60 * _S)
         self._outlet = Outlet(options, self.counts, self._log)
         self._handlers: dict[str, Callable[[MavlinkMessage, int], None]] = {
             "HOME_POSITION": self._on_home,
@@ -230,8 +241,13 @@ class LinkProtocol:
         # Printable only: what comes over a radio must not steer a terminal.
         text = "".join(c if c.isprintable() else "?" for c in str(m.text))
         self._log(arrival_ns, level, f"text.{hash(text) % 64}", f"autopilot says: {text}")
+        self.monitor.heard(text)
 
     def _on_command_ack(self, m: MavlinkMessage, arrival_ns: int) -> None:
+        if m.command == dialect.MAV_CMD_SET_EKF_SOURCE_SET and m.result != dialect.MAV_RESULT_IN_PROGRESS:
+            number = self.source_set.answered()
+            if number is not None and m.result != dialect.MAV_RESULT_ACCEPTED:
+                logger.warning("autopilot refuses to take EKF source set %d (result %d)", number, m.result)
         if m.result not in (dialect.MAV_RESULT_ACCEPTED, dialect.MAV_RESULT_IN_PROGRESS):
             self.counts["commands_refused"] += 1
 
@@ -285,6 +301,7 @@ class LinkProtocol:
             for stream in self._streams.values()
             if stream.due(now_ns)
         ]
+        out += self._watch(vehicle.autopilot, now_ns)
         if self.telemetry.gimbal is not None:
             out += [
                 self._command(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_ns / 1e3, component)
@@ -292,6 +309,41 @@ class LinkProtocol:
             ]
         out += self.parameters.poll(now_ns, vehicle.system_id, vehicle.autopilot)
         return out
+
+    def _watch(self, autopilot: Autopilot, now_ns: int) -> list[MavlinkMessage]:
+        """See what becomes of the fixes; returns the command for a source set where one is due."""
+        if self._monitor_timer.due(now_ns):
+            self.monitor.assess(now_ns, self.state_at, autopilot)
+        if self._advice_timer.due(now_ns):
+            self._tell_delays()
+        number = self.source_set.due(now_ns)
+        return [] if number is None else [self._command(dialect.MAV_CMD_SET_EKF_SOURCE_SET, number)]
+
+    def sent(self, outgoing: Outgoing, now_ns: int) -> None:
+        """An estimate was handed to the line."""
+        if outgoing.repeat == 0:
+            self.latency.add(now_ns - outgoing.capture_ns)
+        if self._vehicle is not None:
+            self.monitor.sent(outgoing.estimate, now_ns, self.state_at, self._vehicle.autopilot)
+
+    @property
+    def fusion(self) -> FusionReport:
+        return self.monitor.report
+
+    def delay_advice(self) -> DelayAdvice | None:
+        """What the autopilot should be told of our latency; None before a fix was sent."""
+        if self._vehicle is None:
+            return None
+        return advise(
+            self._vehicle.autopilot, self.release.mode, self.latency, self._options.fixed_latency_ms,
+            self.timesync.last_round_trip_ns,
+        )  # fmt: skip
+
+    def _tell_delays(self) -> None:
+        advice = self.delay_advice()
+        if advice is not None and (self._advice is None or advice.differs(self._advice)):
+            self._advice = advice
+            logger.info("measured latency asks for %s", advice)
 
     @property
     def sinks(self) -> tuple[Sink, ...]:
@@ -374,8 +426,17 @@ class LinkProtocol:
         round_trip = self.timesync.last_round_trip_ns
         vehicle = self._vehicle
         version = vehicle.firmware_version if vehicle else None
+        advice = self.delay_advice()
         return {
             **self.counts,
+            **{f"release.{name}": count for name, count in self.release.counts.items()},
+            "displacement_trusted": self.release.displacement_trusted,
+            "latency_median_ms": self.latency.percentile_ms(50.0),
+            "latency_p99_ms": self.latency.percentile_ms(99.0),
+            "delay_advice": None if advice is None else str(advice),
+            "fusion": self.fusion.state.value,
+            "fusion_since_s": (now_ns - self.fusion.since_ns) / _S if self.fusion.since_ns else None,
+            "fusion_reason": self.fusion.reason,
             "connected": self.connected(now_ns),
             "autopilot": vehicle.autopilot.value if vehicle else None,
             "vehicle_system_id": vehicle.system_id if vehicle else None,

@@ -1,0 +1,283 @@
+"""What goes out between fixes: where it says the vehicle is, how sure it claims to be, and when it falls silent."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ortholoc_edge.adapters.mavlink.geodesy import Place
+from ortholoc_edge.adapters.mavlink.options import LinkOptions
+from ortholoc_edge.adapters.mavlink.release import Outgoing, Release, shares
+from ortholoc_edge.geometry import rotation
+
+from .link_scenes import MS, ORIGIN, Flight, S
+
+
+def make(**options) -> Release:
+    return Release(LinkOptions(endpoint="udp:x:1", **options))
+
+
+def fly(
+    release: Release, flight: Flight, until_ns: int, fixes: dict[int, object], start_ns: int = 0, step_ns: int = 10 * MS
+) -> list[tuple[int, Outgoing]]:
+    """(when, what) went out; ``fixes`` by the time at which they are ready."""
+    out = []
+    for now in range(start_ns, until_ns, step_ns):
+        if now in fixes:
+            release.take(fixes[now], now, flight.look)
+        outgoing = release.due(now, flight.look)
+        if outgoing is not None:
+            out.append((now, outgoing))
+    return out
+
+
+def regular(flight: Flight, every_ns: int = 500 * MS, latency_ns: int = 300 * MS, count: int = 20, **fix):
+    return {S + i * every_ns + latency_ns: flight.fix(S + i * every_ns, **fix) for i in range(count)}
+
+
+def test_fast_forward_says_where_the_vehicle_is_now():
+    flight = Flight()
+    out = fly(make(), flight, 6 * S, regular(flight, yaw_error=0.1))
+    assert len(out) > 40
+    for now, outgoing in out:
+        estimate = outgoing.estimate
+        assert estimate.stamp_ns == now
+        assert estimate.position_ned_m == pytest.approx(flight.truth(now / S), abs=1e-6)
+        # The map's heading: what the fix differed by from the autopilot's is kept while it turns.
+        expected = rotation.exp([0.0, 0.0, 0.1]) @ flight.attitude(now / S)
+        assert estimate.ned_from_body == pytest.approx(expected, abs=1e-9)
+        assert (estimate.reset_counter, estimate.quality) == (1, 0.8)
+
+
+def test_ten_a_second_whatever_the_fixes_do():
+    flight = Flight()
+    out = fly(make(), flight, 8 * S, regular(flight))
+    steps = np.diff([now for now, _ in out])
+    assert set(steps) == {100 * MS}
+    assert [o.repeat for _, o in out[:10]] == [0, 1, 2, 3, 4] * 2
+    release = make(estimate_rate_hz=20.0)
+    assert set(np.diff([now for now, _ in fly(release, flight, 8 * S, regular(flight))])) == {50 * MS}
+    assert release.counts["carried"] == 14
+
+
+def test_a_loop_that_fell_behind_sends_no_burst():
+    """ArduPilot drops what comes within 20 ms."""
+    flight = Flight()
+    release = make()
+    release.take(flight.fix(S), S + 300 * MS, flight.look)
+    sent = [now for now in [S + 300 * MS, S + 495 * MS, S + 500 * MS, S + 510 * MS, S + 545 * MS, S + 600 * MS]
+            if release.due(now, flight.look)]  # fmt: skip
+    assert sent == [S + 300 * MS, S + 495 * MS, S + 600 * MS]
+
+
+@given(st.integers(1, 50), st.integers(1, 400))
+def test_all_that_is_made_of_a_fix_tells_no_more_than_the_fix(expected, sent):
+    parts = [shares(expected, index) for index in range(sent)]
+    assert sum(parts) < 1.0
+    assert all(a >= b > 0.0 for a, b in itertools.pairwise(parts))
+    # And of the usual number little is lost.
+    assert sum(shares(expected, i) for i in range(expected)) == pytest.approx(expected / (expected + 1))
+
+
+def test_repeats_together_claim_no_more_than_their_fix():
+    """Summed up as a filter does, that takes them for independent."""
+    flight = Flight()
+    out = fly(make(), flight, 12 * S, regular(flight, sigma_m=0.5))
+    for capture, group in itertools.groupby(out, key=lambda entry: entry[1].capture_ns):
+        information = sum(1.0 / o.estimate.covariance[0, 0] for _, o in group)
+        # Before the rhythm is known, the most repeats there may be are reckoned with.
+        least = 0.3 if capture < 2 * S else 0.7
+        assert least / 0.25 < information < 1.0 / 0.25
+
+
+def test_displacement_adds_its_error():
+    flight = Flight()
+    release = make()
+    release.take(flight.fix(S), S + 400 * MS, flight.look)
+    first = release.due(S + 400 * MS, flight.look).estimate.covariance
+    # 0.4 s at 10 m/s: 3 % of 4 m, and 0.2 m/s of drift; eleven times for the ten repeats reckoned with at first.
+    assert first[0, 0] == pytest.approx(11 * (0.25 + 0.12**2 + 0.08**2))
+    assert np.linalg.eigvalsh(first).min() > 0
+
+
+def test_silent_after_a_second_without_a_fix():
+    flight = Flight()
+    release = make()
+    out = fly(release, flight, 6 * S, {S + 300 * MS: flight.fix(S)})
+    assert out[-1][0] == S + 1300 * MS
+    assert release.counts["repeats_ended"] == 1 and release.next_ns() is None
+    again = fly(release, flight, 7 * S, {6 * S + 300 * MS: flight.fix(6 * S)}, start_ns=6 * S)
+    assert again[0][1].repeat == 0 and again[0][0] == 6 * S + 300 * MS
+
+
+def test_silent_when_the_odometry_is_another():
+    """The autopilot restarted, its clock stepped, or its velocity was not finite: no displacement across it."""
+    flight = Flight()
+    flight.epoch_from_ns = 2 * S
+    release = make()
+    fixes = {S + 800 * MS: flight.fix(S + 500 * MS), 2 * S + 300 * MS: flight.fix(S + 900 * MS)}
+    out = fly(release, flight, 4 * S, fixes)
+    assert [now for now, o in out if o.capture_ns == S + 500 * MS][-1] < 2 * S
+    assert release.counts["repeats_broken"] == 1
+    # Captured before, ready after: true at its own stamp, so sent as it is, once.
+    late = [o for _, o in out if o.capture_ns == S + 900 * MS]
+    assert [o.estimate.stamp_ns for o in late] == [S + 900 * MS]
+    assert release.counts["raw_instead"] == 1
+
+
+def test_clock_step_of_the_autopilot_leaves_no_wrong_estimate():
+    """Every estimate is either carried within one odometry or has its capture's stamp; each is where it says."""
+    flight = Flight()
+    flight.known_from_ns = 0
+    release = make()
+    out = []
+    fixes = regular(flight)
+    for now in range(0, 8 * S, 10 * MS):
+        if now == 4 * S:  # histories are empty after it
+            flight.known_from_ns, flight.epoch_from_ns = 4 * S, 4 * S
+        if now in fixes:
+            release.take(fixes[now], now, flight.look)
+        outgoing = release.due(now, flight.look)
+        if outgoing is not None:
+            out.append(outgoing.estimate)
+    assert len(out) > 50 and release.counts["repeats_broken"] + release.counts["raw_instead"] >= 1
+    for estimate in out:
+        assert estimate.position_ned_m == pytest.approx(flight.truth(estimate.stamp_ns / S), abs=1e-6)
+
+
+def test_origin_that_moves_ends_it():
+    flight = Flight()
+    release = make()
+    release.take(flight.fix(S), S + 300 * MS, flight.look)
+    assert release.due(S + 300 * MS, flight.look) is not None
+    flight.origin = type(ORIGIN)(50.001, 7.0, 100.0)
+    assert release.due(S + 400 * MS, flight.look) is None
+    assert release.due(S + 500 * MS, flight.look) is None
+    assert release.counts["repeats_broken"] == 1
+
+
+def test_yaw_wrong_by_180_is_noticed_by_the_second_fix():
+    """Then the velocity points the other way, and what is carried on by it is 20 m/s off."""
+    flight = Flight()
+    flight.reported_velocity = -flight.velocity
+    release = make()
+    fixes = regular(flight, count=30)
+    out = fly(release, flight, 10 * S, fixes)
+    assert not release.displacement_trusted
+    doubted = S + 2 * 500 * MS + 300 * MS
+    for now, outgoing in out:
+        if now >= doubted:
+            # Each once, as it is, with its own stamp.
+            assert outgoing.repeat == 0 and outgoing.estimate.stamp_ns == outgoing.capture_ns
+            assert outgoing.estimate.position_ned_m == pytest.approx(flight.truth(outgoing.capture_ns / S))
+            # An ArduPilot may take it for now: 10 m/s for 0.3 s.
+            assert outgoing.estimate.covariance[0, 0] >= 0.25 + 3.0**2
+    # Right again, it is believed again.
+    flight.reported_velocity = flight.velocity
+    later = {k + 20 * S: flight.fix(v.stamp_ns + 20 * S) for k, v in fixes.items()}
+    again = fly(release, flight, 30 * S, later, start_ns=20 * S)
+    assert release.displacement_trusted and again[-1][1].estimate.stamp_ns == again[-1][0]
+
+
+def test_one_wild_fix_raises_no_lasting_doubt():
+    flight = Flight()
+    release = make()
+    fixes = regular(flight)
+    fixes[S + 5 * 500 * MS + 300 * MS] = flight.fix(S + 5 * 500 * MS, error=(0.0, 30.0, 0.0))
+    fly(release, flight, 10 * S, fixes)
+    # It contradicts the one before it and the one after; the next ones agree, and the doubt goes.
+    assert release.counts["contradicted"] == 2
+    assert release.displacement_trusted
+
+
+def test_capture_stamps_that_step_are_refused():
+    flight = Flight()
+    release = make()
+    assert release.take(flight.fix(3 * S), 2 * S, flight.look) == 1
+    assert release.take(flight.fix(S), 2 * S, flight.look) == 0
+    assert release.take(flight.fix(S), 2 * S + 100 * MS, flight.look) == 1
+    assert release.counts["bad_capture_stamps"] == 2
+    (outgoing,) = [release.due(2 * S, flight.look)]
+    assert outgoing.capture_ns == S
+
+
+def test_fixed_latency_holds_each_fix_to_its_age():
+    flight = Flight()
+    release = make(release="fixed-latency", fixed_latency_ms=600.0)
+    ready = [100, 480, 350, 700, 590, 590]
+    fixes = {S + (i * 250 + ms) * MS: flight.fix(S + i * 250 * MS) for i, ms in enumerate(ready)}
+    out = fly(release, flight, 5 * S, fixes)
+    ages = {o.capture_ns: (now - o.estimate.stamp_ns) // MS for now, o in out}
+    # More than one is under way at a time; one was ready too late, which no holding back mends.
+    assert ages == {S + i * 250 * MS: 700 if ms == 700 else 600 for i, ms in enumerate(ready)}
+    assert +release.counts == {"late_for_release": 1}
+
+
+@pytest.mark.parametrize("options", [{"release": "raw"}, {"estimate_rate_hz": 0.0}])
+def test_raw_is_each_fix_once_as_it_is(options):
+    flight = Flight()
+    release = make(**options)
+    out = fly(release, flight, 6 * S, regular(flight))
+    assert [(now, o.estimate.stamp_ns) for now, o in out] == [
+        (S + i * 500 * MS + 300 * MS, S + i * 500 * MS) for i in range(10)
+    ]
+    assert {o.estimate.covariance[0, 0] for _, o in out} == {0.25}
+
+
+def test_newer_replaces_what_was_not_sent():
+    flight = Flight()
+    release = make(release="raw")
+    assert release.take(flight.fix(S), 2 * S, flight.look) == 0
+    assert release.take(flight.fix(S + 1), 2 * S, flight.look) == 1
+    assert release.due(2 * S, flight.look).capture_ns == S + 1
+    assert release.due(2 * S, flight.look) is None
+
+
+def test_never_carried_by_an_attitude_that_is_not_known():
+    flight = Flight()
+    flight.known_until_ns = S + 200 * MS
+    release = make()
+    release.take(flight.fix(S), S + 300 * MS, flight.look)
+    outgoing = release.due(S + 300 * MS, flight.look)
+    assert outgoing.estimate.stamp_ns == S and release.counts["raw_instead"] == 1
+
+
+@pytest.mark.parametrize(("armed", "landed", "speed_m_s"), [(False, None, 0), (True, True, 0), (True, False, 15)])
+def test_the_first_fix_of_an_autopilot_without_a_position(armed, landed, speed_m_s):
+    """It tells no velocity until it has one, so there is nothing to carry a fix on by."""
+    flight = Flight()
+
+    def look(stamp_ns):
+        return replace(
+            flight.look(stamp_ns), velocity_ned=None, odometry_ned_m=None, local_position_ned_m=None, armed=armed,
+            landed=landed,
+        )  # fmt: skip
+
+    release = make()
+    release.take(flight.fix(S), S + 400 * MS, look)
+    estimate = release.due(S + 400 * MS, look).estimate
+    assert estimate.stamp_ns == S
+    assert estimate.covariance[0, 0] == pytest.approx(0.25 + (0.4 * speed_m_s) ** 2)
+    assert release.due(S + 500 * MS, look) is None
+
+
+def test_a_place_is_carried_on_as_a_local_position_is():
+    """An autopilot without an origin is told of places on WGS 84 only; with one, both are told."""
+    flight = Flight()
+    flight.origin = None
+    local = flight.fix(S)
+    start = Place(50.0, 7.0, 100.0, 147.0)
+    for fix in (replace(local, position_ned_m=None, place=start), replace(local, place=start)):
+        release = make()
+        release.take(fix, S + 500 * MS, flight.look)
+        estimate = release.due(S + 500 * MS, flight.look).estimate
+        assert estimate.stamp_ns == S + 500 * MS
+        # Five metres north, of which a degree has 111.2 km.
+        assert (estimate.place.latitude_deg - 50.0) * 111_229.0 == pytest.approx(5.0, abs=0.01)
+        assert (estimate.place.longitude_deg, estimate.place.height_ellipsoid_m) == pytest.approx((7.0, 147.0))
+        assert (estimate.position_ned_m is None) == (fix.position_ned_m is None)

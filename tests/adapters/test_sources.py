@@ -1,0 +1,169 @@
+"""When the EKF's source set is switched, what the ground station hears, and which delays the measurements ask for."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+
+from ortholoc_edge.adapters.mavlink.estimates import Autopilot
+from ortholoc_edge.adapters.mavlink.herald import Herald
+from ortholoc_edge.adapters.mavlink.latency import LatencyMeter, advise
+from ortholoc_edge.adapters.mavlink.monitor import Fusion, FusionReport
+from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity
+from ortholoc_edge.adapters.mavlink.sources import PendingSwitch, Source, SourceSwitch
+from ortholoc_edge.pipeline.witness import Consistency, WitnessReport
+
+MS, S = 1_000_000, 1_000_000_000
+OK, BAD, SUSPECT, UNKNOWN = Consistency.OK, Consistency.BAD, Consistency.SUSPECT, Consistency.UNKNOWN
+
+
+def make(**options) -> SourceSwitch:
+    return SourceSwitch(LinkOptions(endpoint="udp:x:1", **options))
+
+
+def decide(switch, consistency, at_s, fresh=True, autopilot=Autopilot.ARDUPILOT, restarts=0):
+    return switch.decide(consistency, fresh, autopilot, restarts, round(at_s * S))
+
+
+def test_not_unless_enabled_and_of_ardupilot():
+    assert decide(make(), BAD, 1) is None
+    assert decide(make(switch_sources=True), BAD, 1, autopilot=Autopilot.PX4) is None
+    assert decide(make(switch_sources=True), BAD, 1, autopilot=None) is None
+
+
+def test_to_vision_and_back():
+    switch = make(switch_sources=True, vision_source_set=3, gnss_source_set=1)
+    assert [decide(switch, c, t) for t, c in enumerate([UNKNOWN, OK, SUSPECT])] == [None] * 3
+    there = decide(switch, BAD, 4)
+    assert (there.source, there.number) == (Source.VISION, 3) and len(there.text) <= 50
+    # Once; and not back before GNSS is good again, nor at once.
+    assert [decide(switch, c, 5 + t) for t, c in enumerate([BAD, SUSPECT, UNKNOWN, OK])] == [None] * 4
+    back = decide(switch, OK, 20)
+    assert (back.source, back.number) == (Source.GNSS, 1) and len(back.text) <= 50
+    assert decide(switch, OK, 50) is None
+
+
+def test_without_fixes_it_stays():
+    switch = make(switch_sources=True)
+    assert decide(switch, BAD, 1, fresh=False) is None
+    assert decide(switch, BAD, 2) is not None
+
+
+def test_the_operators_choice_stands():
+    """GNSS good is no reason to switch to GNSS, unless it was us who left it."""
+    assert decide(make(switch_sources=True), OK, 100) is None
+
+
+def test_a_restarted_autopilot_is_told_again():
+    switch = make(switch_sources=True)
+    assert decide(switch, BAD, 1) is not None
+    assert decide(switch, BAD, 30) is None
+    assert decide(switch, BAD, 31, restarts=1).source is Source.VISION
+
+
+def test_flapping_is_bounded():
+    switch = make(switch_sources=True)
+    commands = [t for t in range(600) if decide(switch, BAD if t % 2 else OK, t) is not None]
+    assert min(b - a for a, b in itertools.pairwise(commands)) >= 15
+
+
+def test_two_sets_are_needed():
+    with pytest.raises(ValueError, match="needs two"):
+        make(switch_sources=True, vision_source_set=1)
+
+
+def test_command_is_said_until_answered():
+    pending = PendingSwitch()
+    assert pending.due(0) is None and pending.answered() is None
+    pending.ask(2)
+    assert [pending.due(t * 500 * MS) for t in range(4)] == [2, None, 2, None]
+    assert pending.answered() == 2
+    assert pending.due(100 * S) is None
+    pending.ask(1)
+    assert [pending.due(t * S) for t in range(200, 208)] == [1] * 5 + [None] * 3
+
+
+def report(state: Fusion, reason: str = "why") -> FusionReport:
+    return FusionReport(state, 0, reason)
+
+
+def gnss(state: Consistency, height: float | None = None) -> WitnessReport:
+    return WitnessReport(state, 0, 12.3, height)
+
+
+def test_changes_are_told_once():
+    herald = Herald()
+    assert herald.tell(report(Fusion.UNKNOWN), gnss(UNKNOWN)) == []
+    assert herald.tell(report(Fusion.FUSED), gnss(OK)) == [(Severity.INFO, "OrthoLoC: fixes fused: why")]
+    assert herald.tell(report(Fusion.FUSED, "another"), gnss(OK)) == []
+    lines = herald.tell(report(Fusion.REJECTED), gnss(SUSPECT))
+    assert [severity for severity, _ in lines] == [Severity.WARNING, Severity.WARNING]
+    assert herald.tell(report(Fusion.REJECTED), gnss(BAD)) == [
+        (Severity.ERROR, "OrthoLoC: GNSS contradicts camera, 12 m apart")
+    ]
+    assert herald.tell(report(Fusion.REJECTED), gnss(OK)) == [(Severity.INFO, "OrthoLoC: GNSS agrees again")]
+    datum = herald.tell(report(Fusion.REJECTED), gnss(OK, 47.6))
+    assert datum == [(Severity.WARNING, "OrthoLoC: GNSS is +48 m off map height: datum?")]
+    assert herald.tell(report(Fusion.REJECTED), gnss(OK, 47.9)) == []
+
+
+# -- delays --------------------
+
+
+def meter(*latencies_ms: float) -> LatencyMeter:
+    made = LatencyMeter()
+    for latency in latencies_ms:
+        made.add(round(latency * MS))
+    return made
+
+
+def test_nothing_measured_nothing_advised():
+    assert advise(Autopilot.ARDUPILOT, "raw", meter(), 250.0, 4 * MS) is None
+
+
+# Of a hundred: 5th percentile 124.95, median 169.5 ms.
+SPREAD = [120.0 + i for i in range(100)]
+
+
+@pytest.mark.parametrize(
+    ("mode", "viso"),
+    [
+        # All that is left is the way, half a round trip of 8 ms.
+        ("fast-forward", 4),
+        ("fixed-latency", 204),
+        # ArduPilot knows of the least delay nothing, and of what is beyond it all.
+        ("raw", 129),
+    ],
+)
+def test_viso_delay(mode, viso):
+    advice = advise(Autopilot.ARDUPILOT, mode, meter(*SPREAD), 200.0, 8 * MS)
+    assert advice.viso_delay_ms == viso and not advice.note
+    assert f"VISO_DELAY_MS = {viso}" in str(advice)
+
+
+def test_viso_delay_has_a_limit_that_is_told():
+    advice = advise(Autopilot.ARDUPILOT, "raw", meter(400.0, 420.0), 250.0, 8 * MS)
+    assert advice.viso_delay_ms == 250 and "fast-forward" in advice.note
+
+
+@pytest.mark.parametrize("mode", ["fast-forward", "fixed-latency", "raw"])
+def test_px4_needs_no_delay_where_it_synchronises(mode):
+    advice = advise(Autopilot.PX4, mode, meter(*SPREAD), 250.0, 8 * MS)
+    assert advice.ev_delay_ms == 0
+    # But it stamps GLOBAL_POSITION_SENSOR on arrival.
+    assert advice.agp_delay_ms == {"fast-forward": 4, "fixed-latency": 254, "raw": 174}[mode]
+    assert advice.delay_max_ms == {"fast-forward": 10, "fixed-latency": 260, "raw": 230}[mode]
+
+
+@pytest.mark.parametrize(("mode", "delay"), [("fast-forward", 10), ("fixed-latency", 260), ("raw", 180)])
+def test_px4_stamps_by_arrival_on_a_slow_line(mode, delay):
+    advice = advise(Autopilot.PX4, mode, meter(*SPREAD), 250.0, 20 * MS)
+    assert advice.ev_delay_ms == delay and "round trip of 20 ms" in advice.note
+
+
+def test_only_a_material_change_is_told():
+    first = advise(Autopilot.ARDUPILOT, "raw", meter(*SPREAD), 250.0, 8 * MS)
+    near = advise(Autopilot.ARDUPILOT, "raw", meter(*[v + 9 for v in SPREAD]), 250.0, 8 * MS)
+    far = advise(Autopilot.ARDUPILOT, "raw", meter(*[v + 60 for v in SPREAD]), 250.0, 8 * MS)
+    assert not near.differs(first) and far.differs(first)
