@@ -15,6 +15,12 @@ class Clock(Protocol):
         ...
 
 
+def unix_ns() -> int:
+    """Nanoseconds of the wall clock since 1970, which may be unset or stepped: for names, logs and MAVLink's signing,
+    whose stamps are of the date. Never for what is measured or told to a filter."""
+    return time.time_ns()
+
+
 class SystemClock:
     """CLOCK_MONOTONIC: unaffected by NTP or GNSS steps of the wall clock."""
 

@@ -33,7 +33,7 @@ def write(folder: Path, *changes: tuple[str, str]) -> Path:
     [
         # Not finite.
         ("latency_ms = 45.0", "latency_ms = nan", r"camera\.latency_ms"),
-        ("rate_hz = 10.0 ", "rate_hz = nan ", r"camera\.rate_hz"),
+        ("\nrate_hz = 10.0 ", "\nrate_hz = nan ", r"camera\.rate_hz"),
         ("fx = 910.0", "fx = nan", r"intrinsics\.fx"),
         ("cy = 359.5", "cy = inf", r"intrinsics\.cy"),
         ("[0.0, 0.0, 0.0, 0.0, 0.0]", "[0.0, 0.0, nan, 0.0, 0.0]", r"intrinsics\.distortion\[2\]"),

@@ -46,6 +46,16 @@ class LinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         attitude_rate_hz, position_rate_hz: of ATTITUDE_QUATERNION and LOCAL_POSITION_NED, asked of the
             autopilot.
         set_origin: whether `AutopilotLink.offer_origin` may set the EKF origin of an autopilot that has none.
+        estimate_rate_hz: how often an estimate is expected at most; a serial line must have room for it
+            (`bandwidth`), nothing else depends on it.
+        computer_status_rate_hz: of ONBOARD_COMPUTER_STATUS; 0 sends none.
+        quality_rate_hz: of the three NAMED_VALUE_FLOAT about the last estimate; 0 sends none.
+        signing_key: path of MAVLink 2's signing key, or the name of a systemd credential; None signs nothing and
+            checks nothing.
+        signing_link_id: the link's number in our signatures.
+        signing_state: the file where signing's stamps are kept across restarts; None takes systemd's state folder.
+        require_signed: refuse what is not signed, but for RADIO_STATUS. What is signed by another key is refused
+            anyway.
     """
 
     endpoint: str
@@ -56,6 +66,13 @@ class LinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     attitude_rate_hz: Annotated[float, msgspec.Meta(ge=1, le=400)] = 50.0
     position_rate_hz: Annotated[float, msgspec.Meta(ge=1, le=100)] = 20.0
     set_origin: bool = False
+    estimate_rate_hz: Annotated[float, msgspec.Meta(gt=0, le=50)] = 10.0
+    computer_status_rate_hz: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.2
+    quality_rate_hz: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.5
+    signing_key: Annotated[str, msgspec.Meta(min_length=1)] | None = None
+    signing_link_id: Annotated[int, msgspec.Meta(ge=0, le=255)] = 0
+    signing_state: Annotated[str, msgspec.Meta(min_length=1)] | None = None
+    require_signed: bool = False
 
 
 @dataclass(frozen=True, slots=True)
