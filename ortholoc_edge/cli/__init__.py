@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     # After OPENBLAS_NUM_THREADS is set: these import numpy.
-    from ortholoc_edge.cli import bench, bench_core, bench_packs, localize, models, replay, run, sim, tiles
+    from ortholoc_edge.cli import bench, bench_core, bench_link, bench_packs, localize, models, replay, run, sim, tiles
 
     parser = argparse.ArgumentParser(
         prog="ortholoc-edge",
@@ -57,6 +57,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     parser.add_argument("-v", "--verbose", action="store_true", help="log debugging details to stderr")
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in (sim, run, replay, localize, tiles, models, bench, bench_core, bench_packs):
+    for module in (sim, run, replay, localize, tiles, models, bench, bench_core, bench_link, bench_packs):
         module.add_parser(subparsers)
     return parser

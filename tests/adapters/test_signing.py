@@ -116,8 +116,8 @@ def test_stamps_only_rise_whatever_the_wall_clock_does(steps):
 @settings(deadline=None)  # it writes to a disk
 @given(lives=st.lists(st.tuples(st.integers(0, 40), st.booleans(), st.integers(-4000, 60)), min_size=1, max_size=8))
 def test_no_stamp_is_used_twice_across_crashes(lives, tmp_path_factory):
-    """Each life signs 20 frames a second for some seconds, stores every 10 s, then stops or is killed; the wall clock is
-    anywhere."""
+    """Each life signs 20 frames a second for some seconds, stores every 10 s, then stops or is killed; the wall clock
+    is anywhere."""
     store = StampStore(tmp_path_factory.mktemp("state") / "stamps")
     newest = -1
     for seconds, is_killed, wall_s in lives:
