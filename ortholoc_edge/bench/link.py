@@ -167,7 +167,7 @@ class _Peer:
         self._due = {"beat": 0.0, "ask": 0.0, **dict.fromkeys(_STREAM_HZ, 0.0)}
         self._asked = 0
         self.answers: list[int] = []
-        self.estimates: list[int] = []
+        self.estimates: list[tuple[int, int]] = []
 
     def wait_s(self) -> float:
         """Until something is to be said."""
@@ -182,7 +182,7 @@ class _Peer:
             time.sleep(0.002)
         for message in self._parser.feed(data, arrival_ns):
             if message.get_type() == "ODOMETRY":
-                self.estimates.append(arrival_ns - message.time_usec * 1000)
+                self.estimates.append((round(message.x), arrival_ns))
             elif message.get_type() == "TIMESYNC" and message.tc1 == 0:
                 self._say(dialect.MAVLink_timesync_message(tc1=arrival_ns, ts1=message.ts1))
             elif message.get_type() == "TIMESYNC" and message.ts1 == self._asked:
@@ -280,8 +280,9 @@ class Autopilot:
         """Break the connection; it can be made again at once."""
         self._pipe.send("cut")
 
-    def told(self) -> tuple[list[int], list[int]]:
-        """(round trips of TIMESYNC, ages of estimates on arrival) since the mark, ns."""
+    def told(self) -> tuple[list[int], list[tuple[int, int]]]:
+        """Since the mark: round trips of TIMESYNC, ns; and of each estimate how far north it was, m, and when it
+        arrived, ns."""
         self._pipe.send("tell")
         answers, estimates = self._pipe.recv()
         return answers, estimates
@@ -376,7 +377,7 @@ class Latencies(msgspec.Struct, frozen=True, kw_only=True):
     """Of one wire under one load.
 
     Attributes:
-        estimate: from before an estimate is made and handed over until its bytes were read at the other end.
+        estimate: from handing an estimate over until its bytes were read at the other end.
         timesync: from the other end's question to our answer there.
         is_realtime: whether the other end ran at real-time priority; if not, its own waiting is in the figures.
         load_fps: frames that the load localized, per second.
@@ -413,22 +414,25 @@ def measure(kind: WireKind, seconds: float, load: LocalizerLoad | None, seed: in
         _wait_until(lambda: link.connected() and link.statistics()["synchronised"] is True, "the link is up")
         autopilot.mark()
         steps, begin = (0 if load is None else load.steps), time.monotonic()
+        sent_ns: list[int] = []
         while time.monotonic() - begin < seconds:
             time.sleep(rng.uniform(0.5, 1.5) / _ESTIMATE_HZ)
-            link.send_estimate(
-                VisionEstimate(time.monotonic_ns(), np.array([1.0, 2.0, -80.0]), np.eye(3), np.diag([1.0] * 6))
-            )
+            # Each a metre on from the last: that is how its arrival is known.
+            place = np.array([float(len(sent_ns)), 2.0, -80.0])
+            estimate = VisionEstimate(time.monotonic_ns(), place, np.eye(3), np.eye(6))
+            sent_ns.append(time.monotonic_ns())
+            link.send_estimate(estimate)
         took = time.monotonic() - begin
         if load is not None and load.failure is not None:
             raise LinkError(f"the load failed: {load.failure!r}") from load.failure
         done = 0 if load is None else load.steps - steps
         # The last one is on its way.
         time.sleep(0.1)
-        answers, estimates = autopilot.told()
+        answers, arrived = autopilot.told()
         return Latencies(
             wire=kind,
             load="idle" if load is None else "localizing",
-            estimate=spread(estimates),
+            estimate=spread([arrival_ns - sent_ns[number] for number, arrival_ns in arrived]),
             timesync=spread(answers),
             is_realtime=autopilot.is_realtime,
             load_fps=done / took,

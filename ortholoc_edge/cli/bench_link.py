@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import os
 import sys
 import tempfile
@@ -71,12 +72,20 @@ def run(args: argparse.Namespace) -> int:
     cv2.setNumThreads(1)
     if not args.json:
         print(f"{provenance()}, load {os.getloadavg()[0]:.1f} when it began\n")
-    if args.soak is not None:
-        return _soak(args)
-    if args.fuzz is not None:
-        return _fuzz(args)
-    _latencies(args)
-    return 0
+    chatty = logging.getLogger("ortholoc_edge.adapters")
+    level = chatty.level
+    if not args.verbose:
+        # Connections that break are what is tried here, not news.
+        chatty.setLevel(logging.ERROR)
+    try:
+        if args.soak is not None:
+            return _soak(args)
+        if args.fuzz is not None:
+            return _fuzz(args)
+        _latencies(args)
+        return 0
+    finally:
+        chatty.setLevel(level)
 
 
 def _latencies(args: argparse.Namespace) -> None:
