@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
+from pathlib import Path
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -109,3 +110,11 @@ def test_plan_is_said_at_the_start(caplog, tmp_path):
     assert any(line.startswith("link to the autopilot: ") and "% of the line" in line for line in lines)
     assert any(line.startswith("link from the autopilot: ") and "ATTITUDE_QUATERNION 50 Hz" in line for line in lines)
     assert any(r.levelname == "WARNING" and "TIMESYNC" in r.getMessage() for r in caplog.records)
+
+
+def test_documented_figures_are_those_of_the_plan():
+    text = (Path(__file__).resolve().parents[2] / "docs" / "link.md").read_text(encoding="utf-8")
+    for name, options in (("plain", {}), ("signed", {"signing_key": "/key"})):
+        told = plan(**options)
+        to, back = (f"{total_bytes_per_s(way):.0f} bytes/s" for way in (told.to_autopilot, told.from_autopilot))
+        assert f"| {name} | {to} | {back} |" in text
