@@ -15,17 +15,17 @@ class Clock(Protocol):
         ...
 
 
-def unix_ns() -> int:
-    """Nanoseconds of the wall clock since 1970, which may be unset or stepped: for names, logs and MAVLink's signing,
-    whose stamps are of the date. Never for what is measured or told to a filter."""
-    return time.time_ns()
-
-
 class SystemClock:
     """CLOCK_MONOTONIC: unaffected by NTP or GNSS steps of the wall clock."""
 
     def now_ns(self) -> int:
         return time.monotonic_ns()
+
+
+def wall_clock_ns() -> int:
+    """Nanoseconds since 1970, as the system believes. Steps, and is wrong where it was never set: for messages that
+    must bear a date, never for stamps."""
+    return time.time_ns()
 
 
 class ManualClock:

@@ -15,7 +15,7 @@ from msgspec import Meta, Struct, field
 
 from ortholoc_edge.adapters.bus import BusOptions
 from ortholoc_edge.adapters.camera import CameraOptions
-from ortholoc_edge.adapters.mavlink import LinkOptions
+from ortholoc_edge.adapters.mavlink import GimbalSelection, LinkOptions
 from ortholoc_edge.errors import ConfigError
 from ortholoc_edge.geometry import frames, rotation
 from ortholoc_edge.geometry.arrays import FloatArray
@@ -49,30 +49,77 @@ class Intrinsics(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class MountOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How the camera sits on the vehicle.
+    """How the camera sits on the vehicle, or in a gimbal on it.
 
     Attributes:
-        preset: "nadir-nose-up": straight down, image top toward the nose; "forward": along the nose, level.
-        roll_deg, pitch_deg, yaw_deg: the mount is turned by these from the preset, about the body's axes, as
-            ZYX angles. A camera that looks forward and down by 60 degrees is "forward" with pitch_deg = -60.
-        lever_arm_m: of the camera from the body's reference point: forward, right, down.
+        preset: one of `frames.MOUNTS`. "nadir-nose-up": straight down, image top toward the nose; so also
+            "nadir-right-up", "nadir-tail-up", "nadir-left-up". "forward": along the nose, level; in a gimbal, along
+            its line of sight.
+        roll_deg, pitch_deg, yaw_deg: the mount is turned by these from the preset, about the body's axes (the
+            gimbal's), as ZYX angles. A camera that looks forward and down by 60 degrees is "forward" with
+            pitch_deg = -60.
+        lever_arm_m: of the camera from the body's reference point: forward, right, down. With a gimbal: of the point
+            that it turns about.
+        gimbal: "none": a fixed mount. "auto": the one that is heard. "device": the one of ``gimbal_device``.
+        gimbal_device: MAVLink's gimbal device id, see `GimbalSelection.device`.
+        gimbal_delay_ms: a report tells the attitude of so long before its stamp.
+        gimbal_max_age_ms: a frame farther than this from the nearest report has no attitude, and gives no fix.
+        gimbal_sigma_deg: 1-sigma of the gimbal's own tilt and heading, at rest; while it turns more is added for
+            what its reports' times are worth.
+        gimbal_arm_m: the camera from the point that the gimbal turns about, in the gimbal's axes: forward along the
+            line of sight, right, down.
     """
 
-    preset: Literal["nadir-nose-up", "forward"] = "nadir-nose-up"
+    preset: str = "nadir-nose-up"
     roll_deg: float = 0.0
     pitch_deg: float = 0.0
     yaw_deg: float = 0.0
     lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gimbal: Literal["none", "auto", "device"] = "none"
+    gimbal_device: Annotated[int, Meta(ge=1, le=255)] | None = None
+    gimbal_delay_ms: Annotated[float, Meta(ge=0, le=500)] = 0.0
+    gimbal_max_age_ms: Annotated[float, Meta(gt=0, le=2000)] = 200.0
+    gimbal_sigma_deg: tuple[Annotated[float, Meta(gt=0)], Annotated[float, Meta(gt=0)]] = (1.0, 2.0)
+    gimbal_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        self.body_from_camera()
+        if self.preset not in frames.MOUNTS:
+            raise ValueError(f"preset {self.preset!r} is no mount; write one of {', '.join(frames.MOUNTS)}")
+        if self.gimbal != "none" and self.preset != "forward":
+            raise ValueError(
+                f"preset {self.preset!r} with a gimbal: a gimbal looks forward when its angles are zero and tells by "
+                'its pitch that it looks down; write preset = "forward"'
+            )
+        if (self.gimbal == "device") != (self.gimbal_device is not None):
+            raise ValueError(
+                f"gimbal = {self.gimbal!r} with gimbal_device = {self.gimbal_device}: the number goes with "
+                '"device" and only with it'
+            )
+        if self.gimbal == "none" and any(self.gimbal_arm_m):
+            raise ValueError(f"gimbal_arm_m = {list(self.gimbal_arm_m)} without a gimbal; put it into lever_arm_m")
 
     def body_from_camera(self) -> Rigid3:
-        preset = frames.BODY_FROM_NADIR_CAMERA if self.preset == "nadir-nose-up" else frames.BODY_FROM_FORWARD_CAMERA
+        """Of a fixed mount; of a camera in a gimbal see :meth:`body_from_camera_in`."""
+        return Rigid3(self._turn(), np.array(self.lever_arm_m))
+
+    def body_from_camera_in(self, body_from_gimbal: FloatArray) -> Rigid3:
+        """Of a camera in a gimbal whose axes stand so (3, 3)."""
+        pivot = Rigid3(body_from_gimbal, np.array(self.lever_arm_m))
+        return pivot @ Rigid3(self._turn(), np.array(self.gimbal_arm_m))
+
+    def gimbal_selection(self) -> GimbalSelection | None:
+        """What the link needs to know of the gimbal; None without one."""
+        if self.gimbal == "none":
+            return None
+        return GimbalSelection(
+            self.gimbal_device, round(self.gimbal_delay_ms * 1e6), round(self.gimbal_max_age_ms * 1e6)
+        )
+
+    def _turn(self) -> FloatArray:
         turn = rotation.from_euler(
             math.radians(self.roll_deg), math.radians(self.pitch_deg), math.radians(self.yaw_deg)
         )
-        return Rigid3(turn @ preset, np.array(self.lever_arm_m))
+        return np.asarray(turn @ frames.MOUNTS[self.preset], dtype=np.float64)
 
 
 class MapOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -191,7 +238,7 @@ def _not_finite(value: Any, key: str) -> Iterator[str]:
 
 def _contradictions(config: Config) -> Iterator[str]:
     if not config.link.send:
-        yield "`$.link.send` is empty, so no fix would reach the autopilot; name odometry or vision_position_estimate"
+        yield "`$.link.send` is empty, so no fix would reach the autopilot; write [\"auto\"]"
     for side in ("width_px", "height_px"):
         asked, calibrated = getattr(config.camera, side), getattr(config.intrinsics, side)
         if asked is not None and asked != calibrated:

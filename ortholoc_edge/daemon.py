@@ -30,13 +30,11 @@ from ortholoc_edge.adapters.mavlink import (
     Statistic,
     SystemStatus,
 )
-from ortholoc_edge.adapters.mavlink.estimates import (
-    EarthModel,
-    GeodeticOrigin,
-    VisionEstimate,
-    earth_model,
-    ned_from_geodetic,
-)
+from ortholoc_edge.adapters.mavlink.audit import Level
+from ortholoc_edge.adapters.mavlink.checkup import Checkup
+from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate
+from ortholoc_edge.adapters.mavlink.geodesy import EarthModel, GeodeticOrigin, Place, ned_from_geodetic
+from ortholoc_edge.adapters.mavlink.sinks import earth_model
 from ortholoc_edge.adapters.recorder import Recorder
 from ortholoc_edge.clock import Clock, SystemClock
 from ortholoc_edge.config import Config
@@ -47,7 +45,7 @@ from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.matching.registry import make_method
 from ortholoc_edge.matching.types import STRUCTURAL, AnyMatcher
-from ortholoc_edge.pipeline.frame import Frame, VehicleState
+from ortholoc_edge.pipeline.frame import CameraMount, Frame, VehicleState
 from ortholoc_edge.pipeline.localizer import Localizer
 from ortholoc_edge.pipeline.navigator import Navigator
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
@@ -67,6 +65,7 @@ _STATE_WAIT_NS = 150_000_000
 _MAX_ERRORS_IN_A_ROW = 5
 _STATUS_INTERVAL_NS = 1_000_000_000
 _FRESH_FIX_NS = 3_000_000_000
+_MOST_AUDIT_TEXTS = 3
 # A read returns within `_WAIT_S`; a driver that holds it this long is not coming back by itself.
 _CAPTURE_HUNG_NS = 5_000_000_000
 _S = 1_000_000_000
@@ -153,14 +152,15 @@ class Daemon:
                 model_path=None if options.model is None else Path(options.model),
                 model_sha256=options.model_sha256,
             )
-            self._body_from_camera = config.mount.body_from_camera()
             localizer = Localizer(config.intrinsics.camera(), self._store, self._matcher, config.localizer)
             resources.callback(localizer.close)
             # In every life of the program another value, or the autopilot would not notice the restart.
             first_reset_counter = self._clock.now_ns() // _S
-            tracker = Tracker(self._georeference, self._body_from_camera, config.tracker, first_reset_counter)
+            gimbal = config.mount.gimbal_selection()
+            fixed = config.mount.body_from_camera() if gimbal is None else None
+            tracker = Tracker(self._georeference, fixed, config.tracker, first_reset_counter)
             self._navigator = Navigator(localizer, tracker, config.timing.budget_ms)
-            self._link = AutopilotLink(config.link, self._clock)
+            self._link = AutopilotLink(config.link, self._clock, gimbal)
             self._bus = resources.enter_context(closing(Bus(config.bus))) if config.bus.enabled else None
             self._recorder = (
                 resources.enter_context(closing(Recorder(Path(config.log.folder), config.log.max_mb)))
@@ -177,8 +177,12 @@ class Daemon:
         self._last_fix_ns: int | None = None
         self._counts: Counter[str] = Counter()
         self._origin_missing = False
+        self._checkup: Checkup | None = Checkup(
+            self._link, config.link, lever_arm_m=config.mount.lever_arm_m, latency_ms=None
+        )
         self._damage_reported = 0
         self._origin: GeodeticOrigin | None = None
+        self._recovering = False
         self._last_status_ns = 0
 
     @property
@@ -297,8 +301,10 @@ class Daemon:
             self._feed_watchdog()
             return self._age_ms(frame.stamp_ns) < self._config.timing.max_age_ms and not stop.is_set()
 
+        searching = self._navigator.tracker.status is TrackerStatus.SEARCH
         outcome = self._navigator.step(frame, state, proceed)
         if isinstance(outcome, Fix):
+            self._recovering |= searching
             self._last_fix_ns = frame.stamp_ns
             age_ms, limit_ms = self._age_ms(frame.stamp_ns), self._config.timing.max_age_ms
             if age_ms > limit_ms:
@@ -306,7 +312,7 @@ class Daemon:
                 late = Rejected(frame.stamp_ns, Reason.LATE, "a fix, but too old to send, ms", age_ms, limit_ms)
                 self._publish(frame, replace(late, timings_ms=outcome.timings_ms))
                 return
-            self._send(outcome, known)
+            self._send(outcome, known, state)
         self._publish(frame, outcome)
 
     def _age_ms(self, stamp_ns: int) -> float:
@@ -335,6 +341,18 @@ class Daemon:
             known.odometry_epoch,
             position,
             (0.0, 0.0) if known.gnss is None else (known.gnss.sigma_horizontal_m, known.gnss.sigma_vertical_m),
+            self._gimbal_mount(known),
+        )
+
+    def _gimbal_mount(self, known: AutopilotState) -> CameraMount | None:
+        if known.ned_from_gimbal is None or known.ned_from_body is None:
+            return None
+        options = self._config.mount
+        tilt, heading = (
+            math.hypot(math.radians(sigma_deg), known.gimbal_sigma_rad) for sigma_deg in options.gimbal_sigma_deg
+        )
+        return CameraMount(
+            options.body_from_camera_in(known.ned_from_body.T @ known.ned_from_gimbal), (tilt, heading)
         )
 
     def _map_position(self, gnss: GnssPosition) -> FloatArray | None:
@@ -349,33 +367,37 @@ class Daemon:
             self._counts["gnss_unusable"] += 1
             return None
 
-    def _send(self, fix: Fix, known: AutopilotState | None) -> None:
+    def _send(self, fix: Fix, known: AutopilotState | None, state: VehicleState) -> None:
         vehicle, now = self._link.vehicle, self._link.state_at(fix.stamp_ns)
-        if known is None or now is None or vehicle is None:
+        mount = self._navigator.tracker.mount(state)
+        if known is None or now is None or vehicle is None or mount is None:
             self._counts["no_autopilot"] += 1
             return
-        map_from_body = fix.map_from_camera @ self._body_from_camera.inverse()
-        if now.origin is None:
+        map_from_body = fix.map_from_camera @ mount.body_from_camera.inverse()
+        local = [sink.local for sink in self._link.sinks]
+        if now.origin is None and any(local):
             self._counts["no_origin"] += 1
             self._origin_missing = True
             self._offer_origin(map_from_body.translation)
-            return
-        if self._origin is not None and now.origin != self._origin:
+            if all(local):
+                return
+        if any(local) and self._origin is not None and now.origin not in (None, self._origin):
             # What was sent before meant other places; without notice the filter would take this for a jump.
             logger.warning("the autopilot's origin moved")
             self._navigator.tracker.announce_jump()
-        self._origin = now.origin
+        self._origin = now.origin or self._origin
         self._counts["sent"] += 1
-        self._link.send_estimate(
-            vision_estimate(
-                fix,
-                map_from_body,
-                self._georeference,
-                now.origin,
-                earth_model(vehicle.autopilot),
-                self._navigator.tracker.reset_counter,
-            )
+        estimate = vision_estimate(
+            fix,
+            map_from_body,
+            self._georeference,
+            now.origin,
+            earth_model(vehicle.autopilot),
+            self._navigator.tracker.reset_counter,
+            mount.sigma_rad,
         )
+        self._link.send_estimate(estimate, recovery=self._recovering)
+        self._recovering = False
 
     def _offer_origin(self, position_map: FloatArray) -> None:
         place = self._georeference.geodetic_from_map(position_map)
@@ -406,9 +428,29 @@ class Daemon:
         systemd.notify(f"STATUS={status}, {self._counts['fixes']} fixes, {self._counts['rejected']} rejected")
         if self._link.connected():
             self._report_damage()
+            self._report_audit(now_ns)
         if self._origin_missing and self._link.connected():
             self._link.send_status_text(Severity.WARNING, "OrthoLoC: EKF origin unknown, fixes not sent")
             self._origin_missing = False
+
+    def _report_audit(self, now_ns: int) -> None:
+        """Say once what is wrong with the autopilot's settings."""
+        if self._checkup is None or not self._checkup.step(now_ns):
+            return
+        findings = [finding for finding in self._checkup.findings() if finding.level is not Level.NOTE]
+        self._checkup = None
+        for finding in findings:
+            logger.warning(
+                "autopilot: %s is %s, wanted %s: %s; %s",
+                finding.subject, finding.found, finding.wanted, finding.why, finding.remedy,
+            )  # fmt: skip
+        errors = [finding for finding in findings if finding.level is Level.ERROR and finding.change is not None]
+        for finding in errors[:_MOST_AUDIT_TEXTS]:
+            text = f"OrthoLoC: {finding.subject} is {finding.found}, wants {finding.wanted}"
+            self._link.send_status_text(Severity.WARNING, text)
+        if len(errors) > _MOST_AUDIT_TEXTS:
+            self._link.send_status_text(Severity.WARNING, f"OrthoLoC: {len(errors)} settings wrong, see doctor")
+        self._counts["audit_findings"] = len(findings)
 
     def _report_damage(self) -> None:
         """Say that the map has holes: once the autopilot is there, and again if more are found in flight."""
@@ -424,15 +466,18 @@ def vision_estimate(
     fix: Fix,
     map_from_body: Rigid3,
     georeference: Georeference,
-    origin: GeodeticOrigin,
+    origin: GeodeticOrigin | None,
     model: EarthModel,
     reset_counter: int,
+    mount_sigma_rad: tuple[float, float] = (0.0, 0.0),
 ) -> VisionEstimate:
-    """A fix as the autopilot wants it: the body in its local NED, true north.
+    """A fix as the autopilot wants it: the body on WGS 84 and in the autopilot's local NED, true north.
 
     Args:
         map_from_body: of the fix.
+        origin: the autopilot's; without one the estimate has no local position.
         model: by which the autopilot itself relates its local frame to latitude and longitude.
+        mount_sigma_rad: `CameraMount.sigma_rad`: the fix is of the camera, and the body is seen through the gimbal.
     Raises: MapError if the pack does not say how its heights relate to AMSL.
     """
     place = georeference.geodetic_from_map(map_from_body.translation)
@@ -441,15 +486,21 @@ def vision_estimate(
     ned_from_map = frames.map_from_ned_rotation(georeference.convergence_rad(map_from_body.translation[:2])).T
     lever = map_from_body.translation - fix.map_from_camera.translation
     covariance = cov.rotated(cov.of_moved_point(fix.covariance, lever), ned_from_map)
+    covariance[3:, 3:] += cov.turn(mount_sigma_rad)
     # Common to the whole pack: no match tells of it, so it joins only where the height leaves the pack's datum.
     covariance[2, 2] += (georeference.vertical.amsl_sigma_m or 0.0) ** 2
+    position = None
+    if origin is not None:
+        position = ned_from_geodetic(origin, place.lat_deg, place.lon_deg, place.height_amsl_m, model)
     return VisionEstimate(
         fix.stamp_ns,
-        ned_from_geodetic(origin, place.lat_deg, place.lon_deg, place.height_amsl_m, model),
+        position,
         ned_from_map @ map_from_body.rotation,
         covariance,
         reset_counter,
         min(fix.quality, 1.0),
+        Place(place.lat_deg, place.lon_deg, place.height_amsl_m, place.height_ellipsoid_m),
+        origin,
     )
 
 

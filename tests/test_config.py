@@ -38,7 +38,7 @@ def write(folder: Path, *changes: tuple[str, str]) -> Path:
         ("cy = 359.5", "cy = inf", r"intrinsics\.cy"),
         ("[0.0, 0.0, 0.0, 0.0, 0.0]", "[0.0, 0.0, nan, 0.0, 0.0]", r"intrinsics\.distortion\[2\]"),
         ("roll_deg = 0.0", "roll_deg = nan", r"mount\.roll_deg"),
-        ("lever_arm_m = [0.0, 0.0, 0.0]", "lever_arm_m = [0.0, 0.0, -inf]", r"mount\.lever_arm_m\[2\]"),
+        ("\nlever_arm_m = [0.0, 0.0, 0.0]", "\nlever_arm_m = [0.0, 0.0, -inf]", r"mount\.lever_arm_m\[2\]"),
         ("search_sigmas = 2.5", "search_sigmas = nan", r"localizer\.search_sigmas"),
         ("homography_threshold_px = 5.0", "homography_threshold_px = inf", r"localizer\.homography_threshold_px"),
         ("min_spread = 0.12", "min_spread = nan", r"localizer\.gate\.min_spread"),
@@ -51,8 +51,16 @@ def write(folder: Path, *changes: tuple[str, str]) -> Path:
         # Out of range or of the wrong kind.
         ("fy = 910.0", "fy = -910.0", r"\$\.intrinsics\.fy"),
         ("width_px = 1280\nheight", "width_px = 0\nheight", r"\$\.intrinsics\.width_px"),
-        ('"nadir-nose-up" ', '"sideways" ', r"\$\.mount\.preset"),
-        ('send = ["odometry"]', "send = []", r"link\.send"),
+        ('"nadir-nose-up" ', '"sideways" ', r"'sideways' is no mount.*nadir-nose-up, nadir.*, forward.*\$\.mount"),
+        ('gimbal = "none"', 'gimbal = "some"', r"\$\.mount\.gimbal"),
+        ('gimbal = "none"', 'gimbal = "auto"', r"'nadir-nose-up' with a gimbal.*forward.*\$\.mount"),
+        ("# gimbal_device = 154", "gimbal_device = 154", r"gimbal_device = 154.*\$\.mount"),
+        ("gimbal_arm_m = [0.0, 0", "gimbal_arm_m = [0.1, 0", r"without a gimbal.*lever_arm_m.*\$\.mount"),
+        ("gimbal_delay_ms = 0.0", "gimbal_delay_ms = nan", r"mount\.gimbal_delay_ms"),
+        ('send = ["auto"]  ', "send = []  ", r"link\.send"),
+        ('send = ["auto"]  ', 'send = ["auto", "odometry"]  ', r"mixes auto.*\$\.link"),
+        ('send = ["auto"]  ', 'send = ["gps_input", "gps_input"]  ', r"twice.*\$\.link"),
+        ("sensor_id = 1", "sensor_id = 0", r"link\.sensor_id"),
         ('folder = "/var/log/ortholoc-edge"', 'folder = ""', r"\$\.log\.folder"),
         # One table against another.
         ("# width_px = 1280", "width_px = 640", r"camera\.width_px.* 640.*intrinsics\.width_px.* 1280"),
@@ -77,6 +85,13 @@ def test_refused_with_file_and_key(old: str, new: str, named: str, tmp_path: Pat
         [('name = "structural"', 'name = "structural+xfeat"')],
         [('folder = "/var/log/ortholoc-edge"', "")],
         [('preset = "nadir-nose-up"', 'preset = "forward"'), ("pitch_deg = 0.0", "pitch_deg = -60")],
+        [('preset = "nadir-nose-up"', 'preset = "nadir-tail-up"')],
+        [('preset = "nadir-nose-up"', 'preset = "forward"'), ('gimbal = "none"', 'gimbal = "auto"')],
+        [
+            ('preset = "nadir-nose-up"', 'preset = "forward"'),
+            ('gimbal = "none"', 'gimbal = "device"'),
+            ("# gimbal_device = 154", "gimbal_device = 154"),
+        ],
     ],
 )
 def test_accepted(changes: list[tuple[str, str]], tmp_path: Path) -> None:

@@ -84,13 +84,17 @@ def level_drawn_once(
     seen = camera.project(pose.inverse().apply(view.points_local(middle)))
     origin = tuple(int(x) for x in np.round(np.nan_to_num(seen - middle))[0])
     whole = self._likely_shift(view, template, field) if look_wide else None
-    found = structural.structural.correlate(
-        template, field, radius=level.radius_px, cell=level.cell_px, patch_cells=level.patch_cells,
-        stride=level.stride, origin=whole or origin,
+    products = structural.structural.multiply(
+        template, field, radius=level.radius_px, cell=level.cell_px, origin=whole or origin
     )
+    found = products.patches(level.patch_cells, level.stride)
     step = self._adjusted(number, view, found, template, known, pose, whole)
     last = len(self._tuning.levels) - 1
-    return step if step is None or number < last else self._polished(view, found, known, step, structural._SAMPLES)
+    if step is None or number < last:
+        return step
+    cells = products.patches(1)
+    step = self._polished(view, cells, known, step, (level.cell_px / structural._CORRELATED_PX) ** 2)
+    return replace(step, contrast=structural._contrast(view, cells, step.pose))
 
 
 def variants() -> Iterator[Variant]:

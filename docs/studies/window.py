@@ -448,10 +448,9 @@ class Together:
         view = render(self.terrain, camera, pose)
         if view.valid.mean() < structural._MIN_VALID:
             return None
-        found = correlating.correlate(
-            orientation_field(view.image, view.valid), searched, radius=level.radius_px, cell=level.cell_px,
-            patch_cells=level.patch_cells, stride=level.stride,
-        )  # fmt: skip
+        field = orientation_field(view.image, view.valid)
+        products = correlating.multiply(field, searched, radius=level.radius_px, cell=level.cell_px)
+        found = products.patches(level.patch_cells, level.stride)
         peaks = found.peaks()
         good = structural._shown(view, peaks.template_px) & (peaks.score >= structural._MIN_SCORE)
         kept = peaks.take(np.flatnonzero(good))

@@ -18,7 +18,7 @@ import numpy as np
 from msgspec import Struct
 
 from ortholoc_edge.bench import metrics, sequence
-from ortholoc_edge.bench.replay import PriorNoise, noisy_prior
+from ortholoc_edge.bench.replay import PriorNoise, prior_with_errors
 from ortholoc_edge.errors import CameraError, DatasetError, MapError
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.matching.registry import make_method
@@ -33,7 +33,7 @@ from ortholoc_edge.tiles.store import CACHE_BYTES, MapStore
 ANY_BYTES = 2**40
 _MB = 1e6
 # As the systemd unit has them: without, freed memory stays with the process.
-_MALLOC = {"MALLOC_ARENA_MAX": "2", "MALLOC_MMAP_THRESHOLD_": "4000000", "MALLOC_TRIM_THRESHOLD_": "16000000"}
+MALLOC = {"MALLOC_ARENA_MAX": "2", "MALLOC_MMAP_THRESHOLD_": "4000000", "MALLOC_TRIM_THRESHOLD_": "16000000"}
 
 
 def pack_km2(pack: Pack) -> float:
@@ -86,7 +86,7 @@ class LocalizerProcess:
         ask = json.dumps(
             {"pack": str(pack), "flight": str(flight), "matcher": matcher, "features": features, "cache": cache_bytes}
         )
-        environment = {**os.environ, **_MALLOC, "OPENBLAS_NUM_THREADS": "1"}
+        environment = {**os.environ, **MALLOC, "OPENBLAS_NUM_THREADS": "1"}
         self._process = subprocess.Popen(
             [sys.executable, "-c", code, ask], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
         )
@@ -101,7 +101,9 @@ class LocalizerProcess:
     def frame(self, index: int, seed: int) -> Step:
         """Localize a photo from its true pose with the noise of ``seed``."""
         assert self._process.stdin is not None
-        self._process.stdin.write(f"{index} {seed}\n")
+        # Drawn here: numpy.random would stay in the process's memory, and nothing that flies loads it.
+        errors = np.random.default_rng([seed, index]).normal(size=6)
+        self._process.stdin.write(json.dumps([index, errors.tolist()]) + "\n")
         self._process.stdin.flush()
         return Step(**self._answer())
 
@@ -121,7 +123,7 @@ class LocalizerProcess:
 
 
 def serve() -> None:
-    """What `LocalizerProcess` runs: answers a line "photo seed" by the figures of that frame."""
+    """What `LocalizerProcess` runs: answers a line of a photo and its prior's errors by the figures of that frame."""
     ask = json.loads(sys.argv[1])
     imported = _memory_mb()[0]
     matcher = make_method(ask["matcher"], working_px=640, max_keypoints=4096, threads=1)
@@ -133,20 +135,22 @@ def serve() -> None:
         _say(imported_mb=imported, model_mb=with_model, pack_mb=_memory_mb()[0],
              compressed_mb=store.compressed_bytes / _MB, km2=pack_km2(pack), frames=len(recorded))  # fmt: skip
         for line in sys.stdin:
-            index, seed = (int(part) for part in line.split())
+            index, errors = json.loads(line)
             record = recorded[index]
             if record.camera not in localizers:
                 localizers[record.camera] = Localizer(record.camera, store, matcher, LocalizerOptions())
-            _say(**_stepped(record, store, localizers[record.camera], seed))
+            _say(**_stepped(record, store, localizers[record.camera], errors))
         for localizer in localizers.values():
             localizer.close()
 
 
-def _stepped(record: sequence.RecordedFrame, store: MapStore, localizer: Localizer, seed: int) -> dict[str, Any]:
+def _stepped(
+    record: sequence.RecordedFrame, store: MapStore, localizer: Localizer, errors: list[float]
+) -> dict[str, Any]:
     truth = record.map_from_camera
     ground_m = store.ground_near(truth.translation[:2])
     height_m = float(truth.translation[2]) - (ground_m or 0.0)
-    prior = noisy_prior(truth, height_m, PriorNoise(), np.random.default_rng([seed, record.stamp_ns]))
+    prior = prior_with_errors(truth, height_m, PriorNoise(), errors)
     try:
         frame = Frame(record.stamp_ns, record.image(), record.name)
     except CameraError as err:

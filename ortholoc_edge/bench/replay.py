@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
+import numpy.typing as npt
 
 from ortholoc_edge.bench import sequence
 from ortholoc_edge.bench.metrics import PoseError, pose_error
@@ -269,14 +270,21 @@ def replay_sample(
 
 def noisy_prior(truth: Rigid3, height_m: float, noise: PriorNoise, random: np.random.Generator) -> PosePrior:
     """The truth with the noise's position and attitude errors, and the covariance that belongs to them."""
+    return prior_with_errors(truth, height_m, noise, random.normal(size=6))
+
+
+def prior_with_errors(truth: Rigid3, height_m: float, noise: PriorNoise, errors: npt.ArrayLike) -> PosePrior:
+    """`noisy_prior` with the errors that were drawn: (6,) in standard deviations, of roll, pitch, yaw, east, north and
+    up."""
+    drawn = np.asarray(errors, dtype=np.float64)
     sigmas_m = [length.at(height_m) for length in noise.position]
     sigma_rad = np.radians(noise.attitude_deg)
     map_from_body = truth.rotation @ frames.BODY_FROM_NADIR_CAMERA.T
     # Level axes need a frame whose third axis is vertical; ENU and NED differ by a turn that cancels.
     ned_from_body = frames.ENU_FROM_NED @ map_from_body
-    roll, pitch, yaw = random.normal(size=3) * sigma_rad
+    roll, pitch, yaw = drawn[:3] * sigma_rad
     turned = frames.ENU_FROM_NED @ _perturbed(ned_from_body, roll, pitch, yaw)
-    position = truth.translation + random.normal(size=3) * (sigmas_m[0], sigmas_m[0], sigmas_m[1])
+    position = truth.translation + drawn[3:] * (sigmas_m[0], sigmas_m[0], sigmas_m[1])
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = np.diag(np.square([sigmas_m[0], sigmas_m[0], sigmas_m[1]]))
     covariance[3:, 3:] = cov.attitude(turned, (sigma_rad[0], sigma_rad[1], sigma_rad[2]))

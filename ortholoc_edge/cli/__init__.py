@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import logging
 import os
 import sys
@@ -14,14 +15,21 @@ from ortholoc_edge.errors import ConfigError, OrtholocError
 EXIT_FAILED = 1
 EXIT_CONFIG = 78  # EX_CONFIG: systemd's RestartPreventExitStatus, a restart can't mend a typo
 
+# Each in the module of its name.
+_COMMANDS = (
+    "sim", "run", "doctor", "replay", "localize", "tiles", "models", "bench", "bench-core", "bench-link", "bench-packs",
+)  # fmt: skip
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of ``ortholoc-edge``. Returns the exit code."""
     # OpenBLAS threads fight the pipeline's own for two cores; nearest-neighbour search took four times the
     # CPU with them (matchers.md). It reads this once, when numpy is first imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    parser = _parser()
-    args = parser.parse_args(argv)
+    given = sys.argv[1:] if argv is None else argv
+    # What the others import, for building packs above all, would stay in the daemon's memory: 25 MB.
+    command = next((word for word in given if not word.startswith("-")), None)
+    args = _parser((command,) if command in _COMMANDS else _COMMANDS).parse_args(given)
     logging.basicConfig(
         stream=sys.stderr,
         level=logging.DEBUG if args.verbose else logging.INFO,
@@ -46,10 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
 
 
-def _parser() -> argparse.ArgumentParser:
-    # After OPENBLAS_NUM_THREADS is set: these import numpy.
-    from ortholoc_edge.cli import bench, bench_core, bench_link, bench_packs, localize, models, replay, run, sim, tiles
-
+def _parser(commands: Sequence[str] = _COMMANDS) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="ortholoc-edge",
         description="Tells a drone without GNSS where it is, from its camera, an orthophoto and a surface model.",
@@ -57,6 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     parser.add_argument("-v", "--verbose", action="store_true", help="log debugging details to stderr")
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in (sim, run, replay, localize, tiles, models, bench, bench_core, bench_link, bench_packs):
-        module.add_parser(subparsers)
+    for command in commands:
+        # Only after OPENBLAS_NUM_THREADS is set: it imports numpy.
+        importlib.import_module(f"{__name__}.{command.replace('-', '_')}").add_parser(subparsers)
     return parser

@@ -35,10 +35,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "bench-core",
         help="measure the localization core: accuracy, time, honesty, hostile frames, beside the paper's pipeline",
         description="Prints the section about the localization core of docs/benchmarks.md. Parts: tracking (flights by "
-        "odometer prior), random (random priors: 3° yaw, 1° tilt, 6 %% of the height above ground horizontally, 4 %% "
+        "odometer prior), random (random priors: 3° yaw, 1° tilt, 6 % of the height above ground horizontally, 4 % "
         "vertically), crossdomain (the same on sets of ortholoc_sim.crossdomain), hostile (frames that must not give a "
         "fix), paper (the paper's own pipeline on the same frames). CPU and wall are from the decoded frame to the "
-        "outcome; the first frame of a run does not count in them. A false fix is worse than 10 m, or 10 %% of the "
+        "outcome; the first frame of a run does not count in them. A false fix is worse than 10 m, or 10 % of the "
         "height above ground if that is less, or 5°.",
     )
     parser.add_argument("data", type=Path, metavar="DATA", help="folder with the sets, as for bench")

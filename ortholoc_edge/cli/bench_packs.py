@@ -48,7 +48,7 @@ def _add_size(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         help="localization error against size",
         description="Averages the rasters of real flights to the pixels of public geodata, builds packs of several "
         "qualities and localizes the flights on each. Errors are compared with those on a lossless pack, frame by "
-        "frame with the same noise; intervals are 95 %% by bootstrap over the photos.",
+        "frame with the same noise; intervals are 95 % by bootstrap over the photos.",
     )
     size.add_argument("data", type=Path, metavar="DATA", help="folder with the sets")
     size.add_argument("--sets", nargs="+", default=["seneca", "caliterra"], help="(default: %(default)s)")

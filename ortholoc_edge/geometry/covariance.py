@@ -71,6 +71,13 @@ def attitude(rotation_from_body: npt.ArrayLike, sigma_rad: tuple[float, float, f
     return np.asarray(axes @ np.diag(np.square(sigma_rad)) @ axes.T, dtype=np.float64)
 
 
+def turn(sigma_rad: tuple[float, float]) -> FloatArray:
+    """(3, 3) covariance of the rotation vector, in axes whose third is vertical, of a tilt about any level axis and a
+    heading with these 1-sigmas."""
+    tilt, heading = sigma_rad
+    return np.diag(np.square([tilt, tilt, heading]))
+
+
 def of_moved_point(covariance: FloatArray, lever: npt.ArrayLike) -> FloatArray:
     """Pose covariance (6, 6) of a point of the same body, ``lever`` (3,) away in map axes."""
     jacobian = np.eye(6)

@@ -4,6 +4,7 @@ map     easting, northing, height of the pack's projected CRS; grid north.
 ned     north, east, down of the local tangent plane; true north.
 body    forward, right, down (the autopilot's).
 camera  right, down, forward (OpenCV's).
+gimbal  forward along the line of sight, right, down: level and toward the nose (or north) when all angles are zero.
 
 ``convergence_rad`` is the meridian convergence: the angle from true north to grid north, clockwise positive,
 so that ``yaw_grid = yaw_true - convergence`` (PROJ's ``meridian_convergence``).
@@ -27,6 +28,18 @@ BODY_FROM_NADIR_CAMERA.flags.writeable = False
 # A camera that looks along the nose with the top of its image up.
 BODY_FROM_FORWARD_CAMERA: FloatArray = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 BODY_FROM_FORWARD_CAMERA.flags.writeable = False
+
+# The mounts that have a name, as ``body_from_camera``. "nadir" looks straight down, and the image's top points to the
+# part of the vehicle that is named: of "nadir-right-up" to the right wing.
+MOUNTS: dict[str, FloatArray] = {
+    "nadir-nose-up": BODY_FROM_NADIR_CAMERA,
+    "nadir-right-up": np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]),
+    "nadir-tail-up": np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+    "nadir-left-up": np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+    "forward": BODY_FROM_FORWARD_CAMERA,
+}
+for _mount in MOUNTS.values():
+    _mount.flags.writeable = False
 
 # WGS 84 (EPSG:7030).
 _SEMI_MAJOR_M = 6378137.0

@@ -18,7 +18,7 @@ from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, ImageArray
 
 # Sigma of the Gaussian over the field, and side of the box (used twice) that the strength of edges is averaged over.
 _SMOOTHING_PX: Final = 1.0
-_WINDOW_PX: Final = 11
+_WINDOW_PX: Final = 7
 # Side of the box whose mean is taken off, as a part of the long side; without it a bare field with rows, or two
 # parallel roads, match best where the pictures overlap most (docs/studies/structural.md).
 _MEAN_PART: Final = 1.0 / 3.0

@@ -107,8 +107,7 @@ class Correlation:
         score = centre + np.einsum("ni,ni->n", off, slope + 0.5 * turned)
         return np.where(inside, score, 0.0), np.where(inside[:, None], slope + turned, 0.0), inside
 
-
-    def contrast(self, shift_px: FloatArray, kept: np.ndarray, shared: float) -> float:
+    def contrast(self, shift_px: FloatArray, kept: np.ndarray) -> float:
         """How much better patches fit at one shift (N, 2) of each than two pixels and more beside it, in standard
         deviations of the mean: 0 on average where the shifts have nothing to do with the pictures.
 
@@ -116,8 +115,7 @@ class Correlation:
         patches a peak that agrees with a wrong pose.
 
         Args:
-            kept: (N,) which patches count.
-            shared: how many of them see the same pixel.
+            kept: (N,) which patches count; they should share no pixel.
         Returns: 0 for fewer than 20, or where nothing beside was tried (a radius of 1).
         """
         score, _, inside = self.at(shift_px)
@@ -129,51 +127,69 @@ class Correlation:
         beside = (np.abs(tried - row) >= _BESIDE_PX)[:, None] | (np.abs(tried - column) >= _BESIDE_PX)[None]
         around = np.einsum("yxn,yxn->n", self.scores[:, :, chosen], beside) / beside.sum(axis=(0, 1))
         rise = score[chosen] - around
-        return float(rise.mean() / (max(float(rise.std()), 1e-6) / np.sqrt(len(rise) / shared)))
+        return float(rise.mean() / (max(float(rise.std()), 1e-6) / np.sqrt(len(rise))))
 
 
-def correlate(
-    template: Float32Array,
-    searched: Float32Array,
-    *,
-    radius: int,
-    cell: int,
-    patch_cells: int,
-    stride: int = 1,
-    origin: tuple[int, int] = (0, 0),
-) -> Correlation:
-    """Compare every patch of a field with another field around where it is expected.
+@dataclass(frozen=True, slots=True, eq=False)
+class Products:
+    """How two fields go together cell by cell, at every shift tried: what patches of any size are sums of.
+
+    Attributes:
+        volume, energy: (S, rows, columns) mean product of template and searched field, and mean square of the latter.
+        own: (5, rows, columns) mean products of the template with itself at `_OWN_SHIFTS`.
+        cell: side of a cell, px. radius: largest shift along each axis, px; ``origin`` (x, y) is added to all.
+    """
+
+    volume: Float32Array
+    energy: Float32Array
+    own: Float32Array
+    cell: int
+    radius: int
+    origin: tuple[int, int]
+
+    def patches(self, count: int, stride: int = 1) -> Correlation:
+        """The correlation of patches of ``count`` x ``count`` cells that begin at every ``stride``-th of them."""
+        side = 2 * self.radius + 1
+        if min(self.volume.shape[1:]) < count:
+            empty = np.empty((side, side, 0), np.float32)
+            return Correlation(np.empty((0, 2)), empty, self.origin, np.empty((0, 2, 2)))
+        scores = _patches(self.volume, count, stride)
+        self_scores = _patches(self.own, count, stride)
+        fixed_energy = np.maximum(self_scores[0], _MIN_ENERGY)
+        scores /= np.sqrt(np.maximum(_patches(self.energy, count, stride) * fixed_energy, _MIN_ENERGY))
+        down, across = scores.shape[1:]
+        middle, step = 0.5 * (count * self.cell - 1), stride * self.cell
+        x, y = np.meshgrid(step * np.arange(across) + middle, step * np.arange(down) + middle)
+        return Correlation(
+            np.column_stack([x.ravel(), y.ravel()]),
+            scores.reshape(side, side, -1),
+            self.origin,
+            _sharpness((self_scores / fixed_energy).reshape(len(_OWN_SHIFTS), -1)),
+        )
+
+
+def multiply(
+    template: Float32Array, searched: Float32Array, *, radius: int, cell: int, origin: tuple[int, int] = (0, 0)
+) -> Products:
+    """Compare every cell of a field with another field around where it is expected.
 
     Args:
         template, searched: (2, H, W) float32, of one shape.
         radius: largest shift along each axis, px.
-        cell: side of a cell, px; ``patch_cells`` of them side by side make a patch, and patches begin at every
-            ``stride``-th cell.
+        cell: side of a cell, px; what is left of a cell at the right and lower rim does not count.
         origin: (x, y), added to the shifts that are tried.
     """
     rows, columns = template.shape[1] // cell, template.shape[2] // cell
-    side = 2 * radius + 1
-    if min(rows, columns) < patch_cells:
-        return Correlation(np.empty((0, 2)), np.empty((side, side, 0), np.float32), origin, np.empty((0, 2, 2)))
     height, width = rows * cell, columns * cell
     fixed = template[:, :height, :width]
+    every = [(dx, dy) for dy in range(2 * radius + 1) for dx in range(2 * radius + 1)]
     around = _shifted_window(searched, radius, origin, height, width)
-    every = [(dx, dy) for dy in range(side) for dx in range(side)]
-    scores = _patches(_products(fixed, around, every, cell), patch_cells, stride)
-    energy = _patches(_energies(around, radius, cell, height, width), patch_cells, stride)
+    volume = _products(fixed, around, every, cell)
+    energy = _energies(around, radius, cell, height, width)
+    # As large as a field: not to be held beside the next.
+    del around
     own = _products(fixed, _shifted_window(template, 1, (0, 0), height, width), _OWN_SHIFTS, cell)
-    self_scores = _patches(own, patch_cells, stride)
-    fixed_energy = np.maximum(self_scores[0], _MIN_ENERGY)
-    scores /= np.sqrt(np.maximum(energy * fixed_energy, _MIN_ENERGY))
-    down, across = scores.shape[1:]
-    middle, step = 0.5 * (patch_cells * cell - 1), stride * cell
-    x, y = np.meshgrid(step * np.arange(across) + middle, step * np.arange(down) + middle)
-    return Correlation(
-        np.column_stack([x.ravel(), y.ravel()]),
-        scores.reshape(side, side, -1),
-        origin,
-        _sharpness((self_scores / fixed_energy).reshape(len(_OWN_SHIFTS), -1)),
-    )
+    return Products(volume, energy, own, cell, radius, origin)
 
 
 def _products(
@@ -182,6 +198,8 @@ def _products(
     """(S, rows, columns): mean product over each cell with what lies (x, y) px from the corner of ``around``."""
     _, height, width = fixed.shape
     volume = np.empty((len(shifts), height // cell, width // cell), np.float32)
+    if not volume.size:
+        return volume
     # Some rows of cells at a time, so that all that is multiplied stays in the processor's cache.
     band = max(_BAND_PX // (width * cell), 1) * cell
     for top in range(0, height, band):

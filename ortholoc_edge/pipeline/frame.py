@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
+from ortholoc_edge.geometry.rigid import Rigid3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,6 +24,20 @@ class Frame:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class CameraMount:
+    """How the camera sat on the body at an exposure.
+
+    Attributes:
+        body_from_camera: with the lever arm.
+        sigma_rad: 1-sigma of its rotation beyond what `VehicleState.attitude_sigma_rad` has: tilt, about any level
+            axis, and heading. Zero for a fixed mount.
+    """
+
+    body_from_camera: Rigid3
+    sigma_rad: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class VehicleState:
     """The autopilot's view of the vehicle at ``stamp_ns`` (in replay: a simulated autopilot's).
 
@@ -36,6 +51,8 @@ class VehicleState:
         position_map_m: (3,) easting, northing, height from an absolute source that is trusted now (GNSS before
             it was lost); None otherwise.
         position_sigma_m: 1-sigma of that position, horizontal (per axis) and vertical.
+        mount: of a camera in a gimbal, as it was at the stamp; None of a fixed one, which the tracker knows, and
+            where nothing is known of the gimbal.
     """
 
     stamp_ns: int
@@ -45,3 +62,4 @@ class VehicleState:
     odometry_epoch: int = 0
     position_map_m: FloatArray | None = None
     position_sigma_m: tuple[float, float] = (0.0, 0.0)
+    mount: CameraMount | None = None

@@ -167,8 +167,10 @@ class Localizer:
 
         Raises: ModelError if the matcher itself fails.
         """
-        # Noise, because of an even picture no matcher asks its network.
-        picture = np.random.default_rng(0).integers(0, 256, (self.camera.height, self.camera.width), dtype=np.uint8)
+        # Something like noise, because of an even picture no matcher asks its network; not numpy.random's, which would
+        # stay in memory (3 MB) for this alone. The factor is 2^32 over the golden ratio: a multiplicative hash.
+        pixels = np.arange(self.camera.height * self.camera.width, dtype=np.uint32) ** 2 * np.uint32(2654435769)
+        picture = (pixels >> np.uint32(24)).astype(np.uint8).reshape(self.camera.height, self.camera.width)
         for tracking in self._tracking:
             tracking.fields(picture)
         if self._acquire is not None:
@@ -232,7 +234,7 @@ class Localizer:
                     raise
         elif only_stored:
             raise RejectedError(Reason.NO_PRIOR, "stored features need a predicted pose")
-        return self._by_network(frame, grey, prior, proceed, trace)
+        return self._by_network(frame, grey, prior, proceed, trace, self._tracking[rung] if self._tracking else None)
 
     def _by_structure(
         self,
@@ -246,19 +248,32 @@ class Localizer:
         """The fix without local features."""
         query = self._worker.submit(self._query_fields, tracking, grey, trace)
         try:
-            with trace.stage("map_window"):
-                ground_m, outline = self._predicted_ground(prior)
-                gsd_m = self._distance_to_ground(prior, ground_m) / tracking.finest.focal_px
-                window = self._read(search_bounds(outline, prior, ground_m, self._options.search_sigmas), gsd_m)
-                local = self._local_frame(window, ground_m)
-                terrain = Terrain.of(window, local)
-            if terrain is None:
-                raise RejectedError(Reason.MAP_NODATA, "the surface model has no data under the predicted view")
+            scene, terrain, outline = self._terrain(tracking, prior, trace)
             found = self._track(query.result(), tracking.tuning, terrain, prior, outline, proceed, trace)
         finally:
             query.cancel()
         if (found is None or not found.plausible) and not proceed():
             raise RejectedError(Reason.LATE, "the search ended before anything convinced")
+        return self._structural_fix(frame, found, scene, prior, trace)
+
+    def _terrain(
+        self, tracking: structural.QueryMaker, prior: PosePrior, trace: Trace
+    ) -> tuple[Scene, Terrain, FloatArray]:
+        """The part of the map around a pose, ready for drawing, and the view's footprint (K, 2)."""
+        with trace.stage("map_window"):
+            ground_m, outline = self._predicted_ground(prior)
+            gsd_m = self._distance_to_ground(prior, ground_m) / tracking.finest.focal_px
+            window = self._read(search_bounds(outline, prior, ground_m, self._options.search_sigmas), gsd_m)
+            local = self._local_frame(window, ground_m)
+            terrain = Terrain.of(window, local)
+        if terrain is None:
+            raise RejectedError(Reason.MAP_NODATA, "the surface model has no data under the predicted view")
+        return Scene(window, local, ground_m), terrain, outline
+
+    def _structural_fix(
+        self, frame: Frame, found: structural.Track | None, scene: Scene, prior: PosePrior, trace: Trace
+    ) -> Fix:
+        """What a track is worth, judged by the gate."""
         if found is None:
             raise RejectedError(Reason.FEW_MATCHES, "the map in the predicted view looks nothing like the frame")
         with trace.stage("gate"):
@@ -270,11 +285,38 @@ class Localizer:
             if refusal is not None:
                 raise RejectedError(refusal.reason, refusal.detail, refusal.measured, refusal.limit)
             solved = Solved(
-                found.query_px, local.map_from_local(found.points_local), found.estimate, len(found.query_px)
+                found.query_px, scene.local.map_from_local(found.points_local), found.estimate, len(found.query_px)
             )
             limits = gate.for_structure(found.support, self._options.gate)
-            fix = self._fix(frame, solved, Scene(window, local, ground_m), prior, limits)
+            fix = self._fix(frame, solved, scene, prior, limits)
         return replace(fix, quality=found.support)
+
+    def _refined(
+        self,
+        tracking: structural.QueryMaker,
+        frame: Frame,
+        grey: ImageArray,
+        acquired: Round,
+        scene: Scene,
+        prior: PosePrior,
+        trace: Trace,
+    ) -> Fix | None:
+        """A pose that features gave, followed by structural matching: AdHoP's second look in three dimensions. None
+        where it finds nothing or fails the gate.
+
+        The outcome is judged by the prediction, and not by the pose that it came from: that is of the same picture.
+        """
+        estimate = acquired.estimate
+        if estimate is None or not acquired.is_convincing:
+            return None
+        start = scene.local.map_from_local_pose(estimate.local_from_camera)
+        try:
+            near, terrain, _ = self._terrain(tracking, PosePrior(start, estimate.covariance), trace)
+            query = self._query_fields(tracking, grey, trace)
+            track = structural.Tracking(query, terrain, prior, self.camera, trace, tracking.tuning).run(start=start)
+            return self._structural_fix(frame, track, near, prior, trace)
+        except RejectedError:
+            return None
 
     def _track(
         self,
@@ -311,11 +353,21 @@ class Localizer:
         prior: PosePrior | RegionPrior,
         proceed: Callable[[], bool],
         trace: Trace,
+        tracking: structural.QueryMaker | None,
     ) -> Fix:
-        """The fix from local features of frame and map."""
+        """The fix from local features of frame and map.
+
+        Args:
+            tracking: to refine it by structural matching where that can be, in place of AdHoP.
+        """
         query = self._worker.submit(self._query_features, grey, trace)
         try:
             scene, first = self._first_round(query, prior, proceed, trace)
+            if tracking is not None and isinstance(prior, PosePrior):
+                with trace.stage("refine"):
+                    refined = self._refined(tracking, frame, grey, first, scene.scene, prior, trace)
+                if refined is not None:
+                    return replace(refined, timings_ms=trace.timings_ms())
             second = None
             if self._options.adhop:
                 with trace.stage("adhop"):

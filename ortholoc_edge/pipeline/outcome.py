@@ -17,6 +17,7 @@ class Reason(StrEnum):
     BAD_FRAME = "bad_frame"  # truncated, empty, or of another size than the camera's
     NO_PRIOR = "no_prior"  # nothing says where to look
     BAD_ATTITUDE = "bad_attitude"  # NaN or missing attitude from the autopilot
+    GIMBAL_UNKNOWN = "gimbal_unknown"  # nothing says where the gimbal looked at the exposure
     PRIOR_TOO_WIDE = "prior_too_wide"  # the search would cover more map than may be read
     OUTSIDE_MAP = "outside_map"  # the predicted view does not meet the pack
     MAP_NODATA = "map_nodata"  # the pack has no DOP or no DSM there, or lost it by damage

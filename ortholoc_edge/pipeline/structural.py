@@ -33,7 +33,7 @@ from ortholoc_edge.pose.pnp import PoseEstimate
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """Long side of the picture; radius, cell, cells per patch and stride of `structural.correlate`."""
+    """Long side of the picture; radius and cell of `structural.multiply`; cells per patch and stride of its patches."""
 
     long_px: int
     radius_px: int
@@ -122,9 +122,8 @@ _RIVAL_LESS_PROBABLE = 16.0
 _OWN_PEAK_PX = 4.0
 # Part of the track's support at the second level, below which a rival is not followed to the last.
 _RIVAL_SUPPORT = 0.4
-# Independent samples of a patch of 48 x 48 px (correlated over 3, shared with neighbours), and the highest correlation
-# that counts.
-_SAMPLES, _SAMPLED_PX = 80.0, 48.0
+# Pixels of a field closer than this tell the same; and the highest correlation that counts.
+_CORRELATED_PX = 3.0
 _MAX_SCORE = 0.98
 _POLISHES = 4
 # In standard deviations: what moves the pose by less changes nothing.
@@ -312,14 +311,24 @@ class Tracking:
             upright[3:, 3:] = np.linalg.inv(covariance[3:, 3:])
         self._upright = PoseMeasurement(predicted, upright)
 
-    def run(self, proceed: Callable[[], bool] = lambda: True) -> Track | None:
+    def run(self, proceed: Callable[[], bool] = lambda: True, start: Rigid3 | None = None) -> Track | None:
         """The track from the prediction if it is plausible, else that with the most inliers of it and the best start of
         a search; None if there is none.
 
         Args:
             proceed: asked before the search and each of its starts; False ends it.
+            start: the frame's pose as something else has found it, in the map's coordinates: only that is followed. The
+                prediction stays what the outcome is measured by.
         """
-        best = self._best(proceed)
+        if start is not None:
+            return self._from(self._terrain.local.local_from_map_pose(start))
+        return self._against_rivals(self._best(proceed))
+
+    def _from(self, start: Rigid3) -> Track | None:
+        approach = self._approach(start, [])
+        return self._against_rivals(None if approach is None else self._arrive(approach))
+
+    def _against_rivals(self, best: Track | None) -> Track | None:
         other = None if best is None else self._elsewhere(best)
         if best is None or other is None:
             return best
@@ -421,34 +430,30 @@ class Tracking:
         with self._trace.stage("match"):
             if look_wide:
                 whole = self._likely_shift(view, template, field)
-            found = structural.correlate(
-                template,
-                field,
-                radius=level.radius_px,
-                cell=level.cell_px,
-                patch_cells=level.patch_cells,
-                stride=level.stride,
-                origin=whole or (0, 0),
+            products = structural.multiply(
+                template, field, radius=level.radius_px, cell=level.cell_px, origin=whole or (0, 0)
             )
+            found = products.patches(level.patch_cells, level.stride)
         with self._trace.stage("pose"):
             step = self._adjusted(number, view, found, template, known, pose, whole)
             if step is None or number < len(self._tuning.levels) - 1:
                 return step
+            cells = products.patches(1)
             if self._tuning.polish:
-                samples = _SAMPLES * (level.patch_cells * level.cell_px / _SAMPLED_PX) ** 2
-                step = self._polished(view, found, known, step, samples)
-            return replace(step, contrast=_contrast(view, found, step.pose, level))
+                step = self._polished(view, cells, known, step, (level.cell_px / _CORRELATED_PX) ** 2)
+            return replace(step, contrast=_contrast(view, cells, step.pose))
 
     def _polished(
         self, view: RenderedView, found: structural.Correlation, known: PoseMeasurement, step: _Step, samples: float
     ) -> _Step:
-        """The pose at which all patches together fit best, and not only those with a peak of their own.
+        """The pose at which all cells together fit best, and not only the patches with a peak of their own.
 
-        The likelihood of a patch of n independent samples at correlation r is ``(1 - r^2)^(-n/2)``; its slope and its
-        expected curvature, of the patch's own sharpness, give Newton's step for the pose.
+        The likelihood of a cell of n independent samples at correlation r is ``(1 - r^2)^(-n/2)``; its slope and its
+        expected curvature, of the cell's own sharpness, give Newton's step for the pose.
 
         Args:
-            samples: independent ones of a patch.
+            found: of single cells: they share no pixel, and one that shows what has changed spoils no neighbour.
+            samples: independent ones of a cell.
         """
         pose = step.pose
         points, shown = view.points_local(found.template_px), _shown(view, found.template_px)
@@ -654,12 +659,12 @@ def _turns(sigma_rad: float) -> list[float]:
     return [step * k for k in range(-count, count + 1)]
 
 
-def _contrast(view: RenderedView, found: structural.Correlation, pose: Rigid3, level: Level) -> float:
-    """Of all patches that show map, at a pose."""
-    points = view.points_local(found.template_px)
-    shift, _ = linearised(points, found.template_px, view.camera, pose)
+def _contrast(view: RenderedView, cells: structural.Correlation, pose: Rigid3) -> float:
+    """Of all cells that show map, at a pose."""
+    points = view.points_local(cells.template_px)
+    shift, _ = linearised(points, cells.template_px, view.camera, pose)
     shift = np.where(np.isfinite(shift), shift, np.inf)
-    return found.contrast(shift, _shown(view, found.template_px), (level.patch_cells / level.stride) ** 2)
+    return cells.contrast(shift, _shown(view, cells.template_px))
 
 
 def _absorbed_error_factor(scores: FloatArray) -> float:

@@ -14,7 +14,7 @@ from ortholoc_edge.geometry import covariance as cov
 from ortholoc_edge.geometry import frames
 from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.rigid import Rigid3
-from ortholoc_edge.pipeline.frame import VehicleState
+from ortholoc_edge.pipeline.frame import CameraMount, VehicleState
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.prior import PosePrior
 from ortholoc_edge.tiles.georeference import Georeference
@@ -66,17 +66,18 @@ class Tracker:
     def __init__(
         self,
         georeference: Georeference,
-        body_from_camera: Rigid3,
+        body_from_camera: Rigid3 | None,
         options: TrackerOptions,
         first_reset_counter: int = 0,
     ) -> None:
         """
         Args:
+            body_from_camera: of a fixed mount; None: a gimbal, whose attitude comes with each state.
             first_reset_counter: another one in every life of the program: an autopilot that has seen a value takes
                 it again as "no reset".
         """
         self._georeference = georeference
-        self._body_from_camera = body_from_camera
+        self._fixed_mount = None if body_from_camera is None else CameraMount(body_from_camera)
         self._options = options
         self._anchor: _Anchor | None = None
         self._last_prior: PosePrior | None = None
@@ -92,6 +93,13 @@ class Tracker:
                 state.stamp_ns, Reason.BAD_ATTITUDE, "no finite attitude from the autopilot at the exposure"
             )
         self._take_absolute(state)
+        mount = self.mount(state)
+        if mount is None:
+            return Rejected(
+                state.stamp_ns,
+                Reason.GIMBAL_UNKNOWN,
+                "no attitude of the gimbal near the exposure; is it on, and does [mount] name the right one?",
+            )
         carried = self._carried(state)
         if carried is None:
             return Rejected(state.stamp_ns, Reason.NO_PRIOR, "no fix yet and no position from the autopilot")
@@ -108,10 +116,15 @@ class Tracker:
         body = Rigid3(map_from_ned @ attitude, position)
         covariance = np.zeros((6, 6))
         covariance[:3, :3] = position_covariance
-        covariance[3:, 3:] = cov.attitude(body.rotation, state.attitude_sigma_rad)
-        lever = body.rotation @ self._body_from_camera.translation
-        self._last_prior = PosePrior(body @ self._body_from_camera, cov.of_moved_point(covariance, lever))
+        # The camera's: the gimbal's own error comes on top of the autopilot's.
+        covariance[3:, 3:] = cov.attitude(body.rotation, state.attitude_sigma_rad) + cov.turn(mount.sigma_rad)
+        lever = body.rotation @ mount.body_from_camera.translation
+        self._last_prior = PosePrior(body @ mount.body_from_camera, cov.of_moved_point(covariance, lever))
         return self._last_prior
+
+    def mount(self, state: VehicleState) -> CameraMount | None:
+        """How the camera sat on the body at the state's stamp; None if that is not known."""
+        return self._fixed_mount or state.mount
 
     def update(self, outcome: Outcome, state: VehicleState) -> None:
         """Learn from what the frame of the last `predict` came to."""
@@ -124,7 +137,9 @@ class Tracker:
             return
         if self.status is TrackerStatus.SEARCH or self._jumped(outcome):
             self.reset_counter = (self.reset_counter + 1) % 256
-        body = outcome.map_from_camera @ self._body_from_camera.inverse()
+        mount = self.mount(state)
+        assert mount is not None, "predict() refuses a state without"
+        body = outcome.map_from_camera @ mount.body_from_camera.inverse()
         lever = body.translation - outcome.map_from_camera.translation
         covariance = cov.of_moved_point(outcome.covariance, lever)
         self._anchor = _anchor(state, body.translation, covariance[:3, :3], from_fix=True)

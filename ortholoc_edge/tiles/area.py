@@ -24,8 +24,8 @@ from ortholoc_edge.errors import ConfigError, MapError
 from ortholoc_edge.geometry.arrays import BoolArray, FloatArray
 from ortholoc_edge.geometry.grid import RasterGrid
 from ortholoc_edge.tiles.drawing import LONLAT, Drawing, read_drawing
-from ortholoc_edge.tiles.georeference import projected_crs
 from ortholoc_edge.tiles.lattice import Bounds
+from ortholoc_edge.tiles.systems import projected_crs
 
 # Full width of the strip along a line: a nadir camera of 70 degrees sees 170 m from 120 m up, and navigation
 # without fixes drifts by some tens of metres before the next.
@@ -41,7 +41,7 @@ _MAX_PIECES = 4096
 # Of a pixel: how far the polygons that stand for discs stay inside them.
 _DISC_TOLERANCE_PX = 0.05
 _PROBE_M = 100.0
-# As `Georeference` has it, so that both take the same way through PROJ.
+# As `systems` has it, so that both take the same way through PROJ.
 _INTEREST_MARGIN_DEG = 0.5
 
 

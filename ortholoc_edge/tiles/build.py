@@ -25,13 +25,7 @@ from ortholoc_edge.tiles.area import Area
 from ortholoc_edge.tiles.budget import Estimate, Sampler, Settings, settings_within
 from ortholoc_edge.tiles.cog import block_cache
 from ortholoc_edge.tiles.features import PER_MPX
-from ortholoc_edge.tiles.georeference import (
-    Georeference,
-    VerticalDatum,
-    VerticalKind,
-    datum_shift_caveat,
-    derive_offsets,
-)
+from ortholoc_edge.tiles.georeference import Georeference, VerticalDatum, VerticalKind
 from ortholoc_edge.tiles.install import install, work_folder
 from ortholoc_edge.tiles.lattice import CROP_PX, Lattice, PixelBox, meeting
 from ortholoc_edge.tiles.levels import STORED_LEVELS
@@ -56,6 +50,7 @@ from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.plan import LayerPlan, Plan, lat_lon_of, make_plan, named_vertical
 from ortholoc_edge.tiles.sources import Source, discover, with_common_stretch
 from ortholoc_edge.tiles.store import MapStore
+from ortholoc_edge.tiles.systems import datum_shift_caveat
 from ortholoc_edge.tiles.tasks import (
     DopJob,
     DsmJob,
@@ -69,6 +64,7 @@ from ortholoc_edge.tiles.tasks import (
     run_all,
     write_file,
 )
+from ortholoc_edge.tiles.vertical import derive_offsets
 
 logger = logging.getLogger(__name__)
 

@@ -28,7 +28,7 @@ BLOCK_PX = 512
 
 # An open level that was read from holds 0.9 MB of a DOP, 1.7 MB of a DSM; opening one takes 0.1 to 0.4 ms (measured).
 # The blocks of a tile are read in turn, and what was decoded is kept elsewhere.
-MAX_HANDLES = 2
+MAX_HANDLES = 1
 
 # Of a pixel: what the sums of coordinates of millions of metres may be off.
 _PLACE_SLACK_PX = 1e-3

@@ -15,10 +15,11 @@ from rasterio.warp import transform_bounds
 from ortholoc_edge.errors import ConfigError, MapError
 from ortholoc_edge.geometry.grid import RasterGrid
 from ortholoc_edge.tiles.area import Area, MapArea
-from ortholoc_edge.tiles.georeference import Georeference, VerticalDatum, VerticalKind, projected_crs
+from ortholoc_edge.tiles.georeference import Georeference, VerticalDatum, VerticalKind
 from ortholoc_edge.tiles.lattice import Bounds, Lattice, PixelBox, meeting
 from ortholoc_edge.tiles.resample import same_crs
 from ortholoc_edge.tiles.sources import Source, is_copied, transform_caveat
+from ortholoc_edge.tiles.systems import projected_crs, require_way_to_wgs84
 
 logger = logging.getLogger(__name__)
 
@@ -185,9 +186,12 @@ def _pack_crs(dop: Sequence[Source], dsm: Sequence[Source], wanted: str | None) 
     else:
         crs = _majority_crs(dop)
     west, south, east, north = bounds_in(dop[0], crs)
+    middle = (west + east) / 2, (south + north) / 2
     # The georeference refuses what cannot carry poses: not conformal, not in metres.
     try:
-        Georeference(crs, VerticalDatum(kind="unknown"), ((west + east) / 2, (south + north) / 2))
+        Georeference(crs, VerticalDatum(kind="unknown"), middle)
+        lat, lon = lat_lon_of(crs, [middle])[0]
+        require_way_to_wgs84(crs, (float(lat), float(lon)))
     except MapError as err:
         raise MapError(f"{err}; or let the build warp to another system with --pack-crs EPSG:n") from err
     return crs

@@ -77,7 +77,7 @@ class Source:
         grid: of its pixels, in the units of ``crs`` (which may be degrees).
         gsd_m: true size of a pixel in its middle.
         crs: horizontal system, "EPSG:n" or WKT; None: local metres.
-        vertical: what the system says about heights, see `georeference.vertical_of`.
+        vertical: what the system says about heights, see `vertical.vertical_of`.
         date: of acquisition, 2023, 2023-06 or 2023-06-04.
         bands: red, green, blue, or the heights; counted from 1.
         nir, alpha: of the orthophoto, if it has them.

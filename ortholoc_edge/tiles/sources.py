@@ -22,10 +22,10 @@ from ortholoc_edge.errors import ConfigError, MapError
 from ortholoc_edge.geometry.grid import RasterGrid
 from ortholoc_edge.tiles import points
 from ortholoc_edge.tiles.cog import raster_grid
-from ortholoc_edge.tiles.georeference import vertical_of
 from ortholoc_edge.tiles.prepare import prepare
 from ortholoc_edge.tiles.resample import DopPixels, is_copied, read_dop, read_dsm, transform_caveat
 from ortholoc_edge.tiles.source import Kind, Source, Stretch, fingerprint, named_errors, opened, with_common_stretch
+from ortholoc_edge.tiles.vertical import vertical_of
 
 __all__ = [
     "DopPixels",

@@ -43,6 +43,27 @@ _BASE_MODE, _GUIDED = 217, 4
 _EKF_GOOD = 0x01 | 0x02 | 0x04 | 0x08 | 0x10 | 0x20 | 0x200  # attitude, velocities, positions, prediction
 _EKF_DEAD_RECKONING = 0x01 | 0x02 | 0x04 | 0x20 | 0x80  # no absolute horizontal position; constant position mode
 
+# Of an ArduPilot that is set up for vision in its second source set, so that the daemon's audit finds nothing wrong.
+_PARAMETERS: dict[str, int | float] = {
+    "AHRS_EKF_TYPE": 3,
+    "EK3_ENABLE": 1,
+    "EK3_GLITCH_RAD": 25,
+    "EK3_POS_I_GATE": 500,
+    **{f"EK3_SRC{n}_POSXY": source for n, source in ((1, 3), (2, 6), (3, 0))},
+    **{f"EK3_SRC{n}_VELXY": source for n, source in ((1, 3), (2, 0), (3, 0))},
+    **{f"EK3_SRC{n}_VELZ": source for n, source in ((1, 3), (2, 0), (3, 0))},
+    **{f"EK3_SRC{n}_{what}": 1 for n in (1, 2, 3) for what in ("POSZ", "YAW")},
+    "VISO_TYPE": 1,
+    "VISO_DELAY_MS": 100,
+    "VISO_ORIENT": 0,
+    "VISO_SCALE": 1.0,
+    "VISO_POS_X": 0.0,
+    "VISO_POS_Y": 0.0,
+    "VISO_POS_Z": 0.0,
+    "VISO_POS_M_NSE": 0.2,
+    "VISO_QUAL_MIN": 0,
+}
+
 
 @dataclass(frozen=True, slots=True)
 class SensorOptions:
@@ -105,8 +126,50 @@ class FilterOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class GimbalOptions:
+    """A stabilised gimbal: level in roll, held against the horizon in pitch and against the nose in yaw.
+
+    Attributes:
+        pitch_deg: its middle, -90 is straight down. sweep_deg, sweep_s: it nods about that by so much, in such a time.
+        yaw_deg: from the nose, clockwise.
+        delay_ms: its reports tell where it looked so long before their stamps.
+        error_deg: constant, of the roll and the pitch that it reports.
+    """
+
+    pitch_deg: float = -50.0
+    sweep_deg: float = 10.0
+    sweep_s: float = 12.0
+    yaw_deg: float = 0.0
+    delay_ms: float = 30.0
+    error_deg: tuple[float, float] = (0.3, -0.4)
+
+    def ned_from_gimbal(self, ned_from_body: FloatArray, boot_ns: int) -> FloatArray:
+        """(3, 3), true, at a boot time."""
+        heading_rad = rotation.to_euler(ned_from_body)[2] + math.radians(self.yaw_deg)
+        return rotation.from_euler(0.0, self._pitch_rad(boot_ns), heading_rad)
+
+    def report(self, boot_ns: int) -> Message:
+        """As ArduPilot sends it: roll and pitch against the horizon, yaw against the nose."""
+        roll_deg, pitch_deg = self.error_deg
+        pitch_rad = self._pitch_rad(boot_ns - round(self.delay_ms * _MS)) + math.radians(pitch_deg)
+        q = rotation.to_quaternion(rotation.from_euler(math.radians(roll_deg), pitch_rad, math.radians(self.yaw_deg)))
+        nan = math.nan
+        return dialect.MAVLink_gimbal_device_attitude_status_message(
+            target_system=0, target_component=0, time_boot_ms=boot_ns // _MS % 2**32,
+            flags=dialect.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME, q=[float(v) for v in q], angular_velocity_x=nan,
+            angular_velocity_y=nan, angular_velocity_z=nan, failure_flags=0, delta_yaw=nan, delta_yaw_velocity=nan,
+            gimbal_device_id=1,
+        )  # fmt: skip
+
+    def _pitch_rad(self, boot_ns: int) -> float:
+        phase = 2.0 * math.pi * (boot_ns / _S / self.sweep_s)
+        return math.radians(self.pitch_deg + self.sweep_deg * math.sin(phase))
+
+
+@dataclass(frozen=True, slots=True)
 class AutopilotOptions:
-    """Who it is and how it errs. ``firmware`` decides how covariances are read (2.3: since 4.8 another way)."""
+    """Who it is and how it errs. ``firmware`` decides how covariances are read (2.3: since 4.8 another way).
+    ``gimbal``: the one that it speaks for, if any."""
 
     seed: int = 3
     system_id: int = 1
@@ -116,6 +179,7 @@ class AutopilotOptions:
     # Boot long before the companion's clock began, so that nobody gets by without relating the two.
     boot_offset_ns: int = 86_400 * _S + 123_456_789
     streams_by_default: bool = False
+    gimbal: GimbalOptions | None = None
 
 
 class Verdict(StrEnum):
@@ -331,6 +395,9 @@ class AutopilotCore:
             dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT: self._ekf_status,
             dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION: self._version,
         }
+        gimbal = options.gimbal
+        if gimbal is not None:
+            self._builders[dialect.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS] = lambda: gimbal.report(self._boot_ns)
 
     def _default_intervals(self) -> None:
         if self.options.streams_by_default:
@@ -449,9 +516,28 @@ class AutopilotCore:
         elif name == "VISION_POSITION_ESTIMATE":
             position = np.array([message.x, message.y, message.z])
             self._vision(message.usec, position, message.covariance, message.reset_counter, 0, boot_ns)
+        elif name == "PARAM_REQUEST_READ" and message.target_system == self.options.system_id:
+            return self._parameter(message.param_id)
         elif name == "SET_GPS_GLOBAL_ORIGIN":
             self.counts["origin_refused"] += 1  # it has one, from GNSS
         return []
+
+    @staticmethod
+    def _parameter(name: str) -> list[Message]:
+        """As ArduPilot: numbers of any type as a float, and silence for a name that it does not have."""
+        if name not in _PARAMETERS:
+            return []
+        value = _PARAMETERS[name]
+        kind = dialect.MAV_PARAM_TYPE_REAL32 if isinstance(value, float) else dialect.MAV_PARAM_TYPE_INT16
+        return [
+            dialect.MAVLink_param_value_message(
+                param_id=name.encode(),
+                param_value=float(value),
+                param_type=kind,
+                param_count=len(_PARAMETERS),
+                param_index=65535,
+            )
+        ]
 
     def _command(self, message: Message) -> list[Message]:
         def ack(result: int) -> Message:

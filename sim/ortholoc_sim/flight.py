@@ -79,7 +79,7 @@ class FlightOptions:
         height_agl_m: above the typical ground of the pack; the flight begins 20 m lower.
         duration_s, gnss_until_s: of the flight, from its start.
         frame_rate_hz: of the camera.
-        camera, mount: the one on board.
+        camera, mount: the one on board; where ``mount`` names a gimbal it is in ``autopilot.gimbal``.
         seed: of sensor errors, wind and noise.
         matcher, localizer, timing: of the daemon. Fixes may be older than its default allows: the simulated autopilot
             applies them where their stamps say, and a busy computer draws the camera's pictures too.
@@ -367,14 +367,10 @@ def run_flight(options: FlightOptions, under_test: UnderTest | None = None, cloc
     pack = Pack.open(path)
     site, route = _site_and_route(pack, options)
     placement = _placement(pack, site, options.spec)
-    body_from_camera = options.mount.body_from_camera()
     loop_holder: list[ClosedLoop] = []
 
     def pose_at(stamp_ns: int) -> Rigid3 | None:
-        truth = loop_holder[0].truth_at(stamp_ns) if loop_holder else None
-        if truth is None:
-            return None
-        return site.camera_pose(truth.position_ned_m, truth.ned_from_body, body_from_camera)
+        return true_pose(loop_holder[0], site, options, stamp_ns) if loop_holder else None
 
     outcomes: list[tuple[int, Outcome]] = []
     failures: list[BaseException] = []
@@ -421,6 +417,20 @@ def run_flight(options: FlightOptions, under_test: UnderTest | None = None, cloc
     if failures:
         raise OrtholocError(f"simulated aircraft: {failures[0]}") from failures[0]
     return make_report(loop, site, options, list(outcomes), camera.frames)
+
+
+def true_pose(loop: ClosedLoop, site: Site, options: FlightOptions, stamp_ns: int) -> Rigid3 | None:
+    """``map_from_camera`` as it really is at a stamp; None before the start and in the future."""
+    truth = loop.truth_at(stamp_ns)
+    if truth is None:
+        return None
+    gimbal = options.autopilot.gimbal
+    if gimbal is None:
+        mounted = options.mount.body_from_camera()
+    else:
+        turned = gimbal.ned_from_gimbal(truth.ned_from_body, loop.boot_ns(stamp_ns))
+        mounted = options.mount.body_from_camera_in(truth.ned_from_body.T @ turned)
+    return site.camera_pose(truth.position_ned_m, truth.ned_from_body, mounted)
 
 
 def _fly(
@@ -495,7 +505,6 @@ def make_report(
     start_ns = loop.samples[0].stamp_ns - STEP_NS
     horizontal, position, attitude, latency = [], [], [], []
     fix_t, fix_map = [], []
-    body_from_camera = options.mount.body_from_camera()
     rejections: Counter[str] = Counter()
     frames_after = fixes_after = 0
     for ready_ns, outcome in outcomes:
@@ -504,11 +513,10 @@ def make_report(
         if not isinstance(outcome, Fix):
             rejections[str(outcome.reason)] += 1
             continue
-        truth = loop.truth_at(outcome.stamp_ns)
-        if truth is None:
+        pose = true_pose(loop, site, options, outcome.stamp_ns)
+        if pose is None:
             continue
         fixes_after += outcome.stamp_ns >= lost_ns
-        pose = site.camera_pose(truth.position_ned_m, truth.ned_from_body, body_from_camera)
         difference = outcome.map_from_camera.translation - pose.translation
         difference[:2] /= site.grid_scale
         horizontal.append(float(np.hypot(*difference[:2])))

@@ -1,7 +1,8 @@
 """A small autopilot for tests: speaks MAVLink over a real UDP socket, TCP connection or pseudo-terminal.
 
 It answers as ArduPilot does where it matters to the link: streams only what was asked for, answers and asks
-TIMESYNC, tells its version and origin on request, and counts time from its own boot.
+TIMESYNC, tells its version and origin on request, and counts time from its own boot. It has parameters in the
+encoding of either stack.
 """
 
 from __future__ import annotations
@@ -12,14 +13,17 @@ import os
 import random
 import select
 import socket
+import struct
 import threading
 import time
 import tty
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from ortholoc_edge.adapters.mavlink.codec import payload_of
 from ortholoc_edge.geometry import rotation
 
 
@@ -153,7 +157,17 @@ class FakeAutopilot:
         self.yaw_rate = 0.4
         self.origin: tuple[int, int, int] | None = (507000000, 71000000, 60000)
         self.position_step = 0.0
+        # Makes GIMBAL_DEVICE_ATTITUDE_STATUS of a boot time in ms; None: there is no gimbal.
+        self.gimbal: Callable[[int], Any] | None = None
         self.timesync_answers: list[int] = []
+        self.base_mode = dialect.MAV_MODE_FLAG_SAFETY_ARMED | dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+        self.mavlink1 = False
+        # By name: an int is an integer parameter, a float a real one. Others are not there.
+        self.parameters: dict[str, int | float] = {}
+        self.read_only: set[str] = set()  # keeps its value and tells it
+        self.slow: dict[str, int] = {}  # this many requests go unanswered
+        self.tells_errors = False  # PARAM_ERROR, as the newest ArduPilot
+        self.parameters_set: list[tuple[str, int | float]] = []
         self._asked_ts1 = 0
         self._stop = threading.Event()
         self.thread = threading.Thread(target=self._run, name="fake-autopilot")
@@ -186,7 +200,7 @@ class FakeAutopilot:
                     continue
                 if now_ns >= heartbeat_ns:
                     heartbeat_ns = now_ns + 200_000_000
-                    self._send(dialect.MAVLink_heartbeat_message(2, self.autopilot, 128 | 1, 0, 4, 3))
+                    self._send(dialect.MAVLink_heartbeat_message(2, self.autopilot, self.base_mode, 0, 4, 3))
                 if now_ns >= timesync_ns:
                     timesync_ns = now_ns + 100_000_000
                     self._asked_ts1 = now_ns - self.boot_ns
@@ -199,7 +213,7 @@ class FakeAutopilot:
                             self._send(message)
 
     def _send(self, message):
-        frame = bytes(message.pack(self.mav))
+        frame = bytes(message.pack(self.mav, force_mavlink1=self.mavlink1))
         self.mav.seq = (self.mav.seq + 1) % 256
         if self.noise.random() < self.noise_probability:
             frame = self.noise.randbytes(self.noise.randint(1, 30)) + b"\xfd" + frame
@@ -213,6 +227,9 @@ class FakeAutopilot:
         if kind in (
             "ODOMETRY",
             "VISION_POSITION_ESTIMATE",
+            "GLOBAL_POSITION_SENSOR",
+            "GPS_INPUT",
+            "COMMAND_INT",
             "STATUSTEXT",
             "HEARTBEAT",
             "SET_GPS_GLOBAL_ORIGIN",
@@ -226,6 +243,8 @@ class FakeAutopilot:
                 self.timesync_answers.append(now - message.ts1)
         elif kind == "SET_GPS_GLOBAL_ORIGIN" and self.origin is None:
             self.origin = (message.latitude, message.longitude, message.altitude)
+        elif kind in ("PARAM_REQUEST_READ", "PARAM_SET") and message.target_system == self.system_id:
+            self._parameter(message, message if kind == "PARAM_SET" else None)
         elif kind == "COMMAND_LONG" and message.target_system == self.system_id:
             if message.command == 511:
                 self.intervals_ns[int(message.param1)] = int(message.param2 * 1000)
@@ -234,6 +253,47 @@ class FakeAutopilot:
                 if wanted is not None:
                     self._send(wanted)
             self._send(dialect.MAVLink_command_ack_message(message.command, 0))
+
+    def _parameter(self, message, setting):
+        """As either stack does it: silent for a name that is not there, an echo after setting."""
+        name = message.param_id
+        if self.slow.get(name, 0) > 0:
+            self.slow[name] -= 1
+            return
+        if name not in self.parameters:
+            if self.tells_errors:
+                self._send(dialect.MAVLink_param_error_message(0, 0, name.encode(), -1, 1))
+            return
+        old = self.parameters[name]
+        px4 = self.autopilot == dialect.MAV_AUTOPILOT_PX4
+        if setting is not None:
+            value = self._value_set(setting, isinstance(old, int), px4)
+            if value is None:
+                return
+            self.parameters_set.append((name, value))
+            if name not in self.read_only:
+                self.parameters[name] = value
+        value = self.parameters[name]
+        if isinstance(value, float):
+            kind = dialect.MAV_PARAM_TYPE_REAL32
+        else:
+            small = dialect.MAV_PARAM_TYPE_INT8 if abs(value) < 128 else dialect.MAV_PARAM_TYPE_INT16
+            kind = dialect.MAV_PARAM_TYPE_INT32 if px4 else small
+        wire = struct.unpack("<f", struct.pack("<i", value))[0] if px4 and isinstance(value, int) else float(value)
+        self._send(dialect.MAVLink_param_value_message(name.encode(), wire, kind, 999, 65535))
+
+    @staticmethod
+    def _value_set(message, integer: bool, px4: bool):
+        """The number that the firmware would store; None where it refuses."""
+        if px4:
+            kind = dialect.MAV_PARAM_TYPE_INT32 if integer else dialect.MAV_PARAM_TYPE_REAL32
+            if message.param_type != kind:
+                return None  # "param types mismatch"
+            raw = payload_of(message, 4)[:4]
+            return struct.unpack("<i" if integer else "<f", raw)[0]
+        if not math.isfinite(message.param_value):
+            return None
+        return round(message.param_value) if integer else message.param_value
 
     def _stream(self, message_id: int, now_ns: int):
         boot_ms = (now_ns - self.boot_ns) // 1_000_000
@@ -261,6 +321,8 @@ class FakeAutopilot:
         if self.origin is not None:
             origin = self.origin
             makers[d.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN] = lambda ms: d.MAVLink_gps_global_origin_message(*origin)
+        if self.gimbal is not None:
+            makers[d.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS] = self.gimbal
         make = makers.get(message_id)
         return make(boot_ms) if make else None
 

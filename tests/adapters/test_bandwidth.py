@@ -46,6 +46,10 @@ def test_shares_add_up():
     extra = total_bytes_per_s(both.to_autopilot) - total_bytes_per_s(told.to_autopilot)
     # PX4, for which an unknown autopilot is taken, asks for the time ten times a second.
     assert extra == pytest.approx(252 + 3 * 30 + 9.9 * 28)
+    endpoint = parse_endpoint("serial:/dev/ttyX:57600")
+    gimbal = plan_line(LinkOptions(endpoint="serial:/dev/ttyX:57600"), endpoint, has_gimbal=True)
+    more = total_bytes_per_s(gimbal.from_autopilot) - total_bytes_per_s(plan().from_autopilot)
+    assert more == 20 * frame_bytes("GIMBAL_DEVICE_ATTITUDE_STATUS", is_signed=False)
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import math
 import os
 import socket
 import time
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -19,7 +20,8 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from ortholoc_edge.adapters.mavlink import AutopilotLink, LinkOptions, Severity, SystemStatus
 from ortholoc_edge.adapters.mavlink.codec import FrameParser
-from ortholoc_edge.adapters.mavlink.estimates import Autopilot, GeodeticOrigin, VisionEstimate
+from ortholoc_edge.adapters.mavlink.estimates import Autopilot, VisionEstimate
+from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin, Place
 from ortholoc_edge.adapters.mavlink.history import TimeHistory
 from ortholoc_edge.adapters.mavlink.options import parse_endpoint
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol
@@ -643,21 +645,39 @@ def test_origin_is_offered_only_where_there_is_none():
     assert script.protocol.state_at(script.now).origin.longitude_deg == 7.20001
 
 
+def version(major: int, minor: int):
+    return dialect.MAVLink_autopilot_version_message(
+        0, major << 24 | minor << 16, 0, 0, 0, [0] * 8, [0] * 8, [0] * 8, 0, 0, 0
+    )
+
+
 def test_estimate_takes_the_form_the_firmware_reads():
     script = Script(send=("odometry", "vision_position_estimate"))
-    assert script.protocol.encode_estimate(estimate()) == []
+    assert script.protocol.encode_estimate(estimate(), 0) == [] and script.protocol.sinks == ()
     script.hear(heartbeat(3))
-    odometry, vpe = script.protocol.encode_estimate(estimate())
+    odometry, vpe = script.protocol.encode_estimate(estimate(), 0)
     assert odometry.frame_id == 20 and vpe.get_type() == "VISION_POSITION_ESTIMATE"
     assert vpe.covariance[0] == pytest.approx(math.sqrt(2.0**3 / 2))
-    script.hear(
-        dialect.MAVLink_autopilot_version_message(0, 4 << 24 | 8 << 16, 0, 0, 0, [0] * 8, [0] * 8, [0] * 8, 0, 0, 0)
-    )
-    assert script.protocol.encode_estimate(estimate())[0].pose_covariance[0] == pytest.approx(2.0)
+    script.hear(version(4, 8))
+    assert script.protocol.encode_estimate(estimate(), 0)[0].pose_covariance[0] == pytest.approx(2.0)
     px4 = Script(autopilot=12)
     px4.hear(heartbeat(12))
-    (odometry,) = px4.protocol.encode_estimate(estimate())
+    (odometry,) = px4.protocol.encode_estimate(estimate(), 0)
     assert odometry.frame_id == 1 and odometry.pose_covariance[0] == 4.0
+    px4.hear(version(1, 18))
+    (sensor,) = px4.protocol.encode_estimate(replace(estimate(), place=Place(50.7, 7.1, 90.0)), 5 * MS)
+    assert sensor.get_type() == "GLOBAL_POSITION_SENSOR" and sensor.processing_time == 5000
+
+
+def test_an_estimate_from_before_the_origin_moved_is_not_sent():
+    script = Script()
+    script.hear(heartbeat(3))
+    script.hear(dialect.MAVLink_gps_global_origin_message(507000000, 72000000, 60000))
+    made = replace(estimate(), origin=script.protocol.state_at(script.now).origin)
+    assert len(script.protocol.encode_estimate(made, 0)) == 1
+    script.hear(dialect.MAVLink_gps_global_origin_message(507000100, 72000000, 60000))
+    assert script.protocol.encode_estimate(made, 0) == []
+    assert script.protocol.statistics(script.now)["refused.origin_moved"] == 1
 
 
 ANY_MESSAGE = st.sampled_from(
@@ -722,7 +742,8 @@ def test_endpoints_and_options_are_checked():
     assert parse_endpoint("udp:[::1]:14550").address == "[::1]"
     for bad in (
         {"endpiont": "x"},
-        {"endpoint": "udp:a:1", "send": ["gps_input"]},
+        {"endpoint": "udp:a:1", "send": ["hil_gps"]},
+        {"endpoint": "udp:a:1", "send": ["auto", "odometry"]},
         {"endpoint": "a", "system_id": 256},
     ):
         with pytest.raises(msgspec.ValidationError):

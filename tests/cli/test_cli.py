@@ -62,7 +62,7 @@ def position(truth: Rigid3 = TRUTH, off_m: tuple[float, float, float] = (3.0, -2
 # -- help and errors ---------------------------------------------------------
 
 HELP = [
-    ["sim"], ["run"], ["replay"], ["localize"], ["bench"], ["models", "build"], ["models", "list"],
+    ["sim"], ["run"], ["doctor"], ["replay"], ["localize"], ["bench"], ["models", "build"], ["models", "list"],
     ["tiles", "build"], ["tiles", "info"], ["tiles", "verify"],
 ]  # fmt: skip
 # Their only arguments are required, or there are none.

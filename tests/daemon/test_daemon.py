@@ -24,16 +24,18 @@ import msgspec
 import numpy as np
 import pytest
 from adapters.fake_autopilot import FakeAutopilot, PtyWire, UdpWire, Wire, dialect
+from adapters.firmware_parameters import ARDUPILOT_STOCK
 from ortholoc_sim.site import Site
 from replay import rendered
 
 from ortholoc_edge.adapters import systemd
 from ortholoc_edge.adapters.camera import CameraOptions, EndOfFrames
 from ortholoc_edge.adapters.mavlink import LinkOptions
-from ortholoc_edge.config import Config, Intrinsics, LogOptions, MapOptions, MatcherOptions
+from ortholoc_edge.config import Config, Intrinsics, LogOptions, MapOptions, MatcherOptions, MountOptions
 from ortholoc_edge.daemon import Daemon, LatestSlot
 from ortholoc_edge.errors import MapError, OrtholocError
-from ortholoc_edge.geometry import rotation
+from ortholoc_edge.geometry import frames, rotation
+from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.navigator import TimingOptions
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
@@ -253,6 +255,31 @@ def test_without_an_origin_nothing_is_sent(folder: Path) -> None:
     assert "not sent" in texts[0]
 
 
+def test_wrong_settings_are_told_once(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The ground station sees which parameter is wrong; the log has the command that mends it."""
+    wire = UdpWire()
+    autopilot = HoveringAutopilot(wire)
+    autopilot.parameters = dict(ARDUPILOT_STOCK)
+    daemon = Daemon(config(f"folder:{folder}", f"udpout:127.0.0.1:{wire.port}"))
+    try:
+        with running(daemon):
+            wait_for(lambda: len(settings(autopilot)) == 2 and "audit_findings" in daemon.statistics(), "the audit")
+            asked = autopilot.got_counts["PARAM_REQUEST_READ"]
+            wait_for(lambda: len(autopilot.messages("HEARTBEAT")) >= 12, "some seconds more")
+    finally:
+        autopilot.close()
+    assert settings(autopilot) == [
+        "OrthoLoC: VISO_TYPE is 0, wants 1",
+        "OrthoLoC: EK3_SRC2_POSXY is 0, wants 6",
+    ]
+    assert "param set VISO_TYPE 1" in caplog.text
+    assert autopilot.got_counts["PARAM_REQUEST_READ"] == asked and autopilot.got_counts["PARAM_SET"] == 0
+
+
+def settings(autopilot: HoveringAutopilot) -> list[str]:
+    return [message.text for message in autopilot.messages("STATUSTEXT") if "wants" in message.text]
+
+
 def test_origin_is_offered_where_that_is_allowed(folder: Path) -> None:
     wire = UdpWire()
     autopilot = HoveringAutopilot(wire, with_origin=False)
@@ -335,6 +362,66 @@ def test_a_moved_origin_raises_the_reset_counter(folder: Path) -> None:
     assert after.reset_counter == (before.reset_counter + 1) % 256
 
 
+def automatic(folder: Path, wire: UdpWire, **link: Any) -> Config:
+    base = config(f"folder:{folder}", f"udpout:127.0.0.1:{wire.port}")
+    return msgspec.structs.replace(base, link=msgspec.structs.replace(base.link, send=("auto",), **link))
+
+
+def test_a_place_needs_no_origin_and_does_not_jump_with_it(folder: Path) -> None:
+    """PX4 1.18 takes WGS 84: nothing waits for an origin, and one that moves is no news."""
+    wire = UdpWire()
+    autopilot = HoveringAutopilot(wire, with_origin=False)
+    autopilot.autopilot, autopilot.version = dialect.MAV_AUTOPILOT_PX4, (1, 18, 0)
+    daemon = Daemon(automatic(folder, wire, sensor_id=9))
+
+    def sensor() -> list[Any]:
+        return autopilot.messages("GLOBAL_POSITION_SENSOR")
+
+    def told_latitude() -> int | None:
+        state = daemon.link.state_at(0)
+        return None if state is None or state.origin is None else round(state.origin.latitude_deg * 1e7)
+
+    try:
+        with running(daemon):
+            wait_for(lambda: len(sensor()) >= 2, "two GLOBAL_POSITION_SENSOR")
+            counter = daemon._navigator.tracker.reset_counter
+            for latitude in (507000000, 508000000):
+                autopilot.origin = (latitude, 71000000, 60000)
+                wait_for(lambda latitude=latitude: told_latitude() == latitude or None, "the origin")
+                seen = len(sensor())
+                wait_for(lambda seen=seen: len(sensor()) >= seen + 2, "two more")
+            assert daemon._navigator.tracker.reset_counter == counter
+    finally:
+        autopilot.close()
+    for message in sensor():
+        # 1e-5 degrees are a metre.
+        assert message.lat == pytest.approx(PLACE.lat_deg * 1e7, abs=300)
+        assert message.lon == pytest.approx(PLACE.lon_deg * 1e7, abs=500)
+        assert message.alt == pytest.approx(PLACE.height_amsl_m, abs=3.0)
+        assert message.id == 9
+        assert 0 < message.processing_time < 20_000_000
+        assert message.time_usec >= message.processing_time
+    assert not any("origin" in m.text for m in autopilot.messages("STATUSTEXT"))
+    # The version may not have been told before the first estimates; with no origin they were not sent.
+    assert autopilot.messages("ODOMETRY") == []
+
+
+def test_recovery_is_told_once(folder: Path) -> None:
+    wire = UdpWire()
+    autopilot = HoveringAutopilot(wire)
+    daemon = Daemon(automatic(folder, wire, recovery=True))
+    try:
+        with running(daemon):
+            wait_for(lambda: len(autopilot.messages("ODOMETRY")) >= 4, "four ODOMETRY")
+    finally:
+        autopilot.close()
+    (command,) = autopilot.messages("COMMAND_INT")
+    assert command.command == dialect.MAV_CMD_EXTERNAL_POSITION_ESTIMATE
+    assert command.x == pytest.approx(PLACE.lat_deg * 1e7, abs=300)
+    kinds = [m.get_type() for m in autopilot.got if m.get_type() in ("COMMAND_INT", "ODOMETRY")]
+    assert kinds[:2] == ["COMMAND_INT", "ODOMETRY"]
+
+
 def test_watchdog_starves_when_the_camera_hangs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
     monkeypatch.setattr(systemd, "notify", said.append)
@@ -381,6 +468,65 @@ def test_end_of_the_frames_ends_the_daemon(tmp_path: Path) -> None:
     assert [o.reason for o in outcomes if isinstance(o, Rejected)] == [Reason.BAD_ATTITUDE] * len(outcomes)
     assert outcomes
     assert not [t for t in threading.enumerate() if t.name in ("capture", "recorder", "mavlink")]
+
+
+class BankedAutopilot(HoveringAutopilot):
+    """In a bank of 30 degrees under the same place, with a gimbal that holds its camera on a bearing of 55 degrees,
+    20 degrees off the plumb line."""
+
+    ATTITUDE = rendered.attitude(30.0, PITCH, YAW)
+    GIMBAL = rendered.attitude(0.0, -70.0, 55.0)
+
+    def __init__(self, wire: Wire) -> None:
+        super().__init__(wire)
+        self.gimbal = self.report
+
+    def truth_at(self, now_ns: int) -> np.ndarray:
+        return self.ATTITUDE
+
+    def report(self, boot_ms: int) -> Any:
+        q = [float(v) for v in rotation.to_quaternion(rendered.attitude(0.0, -70.0, 55.0 - YAW))]
+        flags = dialect.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME | dialect.GIMBAL_DEVICE_FLAGS_YAW_LOCK
+        return dialect.MAVLink_gimbal_device_attitude_status_message(
+            0, 0, boot_ms, flags, q, math.nan, math.nan, math.nan, 0, math.nan, math.nan, 1
+        )
+
+
+def test_a_camera_in_a_gimbal(tmp_path: Path) -> None:
+    """What is sent is the body's pose, not the camera's; and nothing once the gimbal is silent."""
+    mount = MountOptions(preset="forward", gimbal="auto", lever_arm_m=(1.5, -0.5, 0.8))
+    map_from_ned = frames.map_from_ned_rotation(rendered.georeference().convergence_rad(TRUTH.translation[:2]))
+    camera = Rigid3(
+        map_from_ned @ BankedAutopilot.GIMBAL @ frames.BODY_FROM_FORWARD_CAMERA,
+        TRUTH.translation + map_from_ned @ BankedAutopilot.ATTITUDE @ mount.lever_arm_m,
+    )
+    data = rendered.write_picture(tmp_path / "photo_000.jpg", rendered.picture(camera)).read_bytes()
+    for number in range(1, 100):
+        (tmp_path / f"photo_{number:03d}.jpg").write_bytes(data)
+    autopilot = BankedAutopilot(UdpWire())
+    outcomes: list[Outcome] = []
+    try:
+        daemon = Daemon(
+            config(f"folder:{tmp_path}", f"udpout:127.0.0.1:{autopilot.wire.port}", mount=mount),
+            on_outcome=lambda _, outcome: outcomes.append(outcome),
+        )
+        with running(daemon):
+            wait_for(lambda: len(autopilot.messages("ODOMETRY")) >= 4, "four ODOMETRY")
+            autopilot.gimbal = None
+            wait_for(lambda: getattr(outcomes[-1], "reason", None) is Reason.GIMBAL_UNKNOWN, "a frame without gimbal")
+            sent, frames_so_far = len(autopilot.messages("ODOMETRY")), len(outcomes)
+            wait_for(lambda: len(outcomes) >= frames_so_far + 4, "four more frames")
+            later = outcomes[frames_so_far:]
+            assert {getattr(outcome, "reason", None) for outcome in later} == {Reason.GIMBAL_UNKNOWN}
+            assert len(autopilot.messages("ODOMETRY")) == sent
+    finally:
+        autopilot.close()
+    assert autopilot.intervals_ns[dialect.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS] == 50_000_000
+    for message in autopilot.messages("ODOMETRY"):
+        turn = rotation.from_quaternion(message.q)
+        assert math.degrees(rotation.angle_between(turn, BankedAutopilot.ATTITUDE)) < 1.5
+        # The camera is 1.7 m from the body.
+        assert np.linalg.norm(np.array([message.x, message.y, message.z]) - TRUE_NED) < 1.0
 
 
 class _BrokenMatcher:

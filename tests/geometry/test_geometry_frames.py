@@ -14,7 +14,7 @@ EAST, NORTH, UP = np.eye(3)
 
 
 def test_constants_are_rotations_or_their_own_inverse_and_read_only():
-    for turn in (frames.ENU_FROM_NED, frames.BODY_FROM_NADIR_CAMERA, frames.BODY_FROM_FORWARD_CAMERA):
+    for turn in (frames.ENU_FROM_NED, *frames.MOUNTS.values()):
         assert np.array_equal(turn @ turn.T, np.eye(3))
         assert np.linalg.det(turn) == pytest.approx(1.0)
         assert not turn.flags.writeable
@@ -26,6 +26,21 @@ def test_nadir_camera_in_words():
     assert np.array_equal(turn @ CAMERA_FORWARD, BODY_DOWN)  # looks down
     assert np.array_equal(turn @ -CAMERA_DOWN, BODY_FORWARD)  # top of the image toward the nose
     assert np.array_equal(turn @ CAMERA_RIGHT, BODY_RIGHT)
+
+
+@pytest.mark.parametrize(
+    ("name", "top"),
+    [
+        ("nadir-nose-up", BODY_FORWARD),
+        ("nadir-right-up", BODY_RIGHT),
+        ("nadir-tail-up", -BODY_FORWARD),
+        ("nadir-left-up", -BODY_RIGHT),
+    ],
+)
+def test_nadir_mounts_have_the_image_s_top_where_they_say(name, top):
+    turn = frames.MOUNTS[name]
+    assert np.array_equal(turn @ CAMERA_FORWARD, BODY_DOWN)
+    assert np.array_equal(turn @ -CAMERA_DOWN, top)
 
 
 def test_forward_camera_in_words():

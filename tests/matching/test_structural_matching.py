@@ -9,7 +9,7 @@ import pytest
 
 from ortholoc_edge.geometry.arrays import Float32Array, FloatArray
 from ortholoc_edge.matching.orientation import orientation_field
-from ortholoc_edge.matching.structural import Correlation, Displacements, correlate, whole_shift
+from ortholoc_edge.matching.structural import Correlation, Displacements, multiply, whole_shift
 
 HEIGHT, WIDTH = 96, 128
 CELL, PATCH_CELLS, RADIUS = 8, 4, 4
@@ -36,7 +36,9 @@ def field(seed: int, shift: tuple[float, float] = (0.0, 0.0), **size: int) -> Fl
 
 def found(template: Float32Array, searched: Float32Array, **changed: Any) -> Displacements:
     options: dict[str, Any] = {"radius": RADIUS, "cell": CELL, "patch_cells": PATCH_CELLS}
-    return correlate(template, searched, **(options | changed)).peaks()
+    options |= changed
+    patch = options.pop("patch_cells"), options.pop("stride", 1)
+    return multiply(template, searched, **options).patches(*patch).peaks()
 
 
 def patches(height: int = HEIGHT, width: int = WIDTH) -> int:
@@ -260,9 +262,7 @@ def test_every_second_patch() -> None:
 
 
 def correlation(shift: tuple[float, float], origin: tuple[int, int] = (0, 0)) -> Correlation:
-    return correlate(
-        field(0), field(0, shift), radius=RADIUS, cell=CELL, patch_cells=PATCH_CELLS, origin=origin
-    )
+    return multiply(field(0), field(0, shift), radius=RADIUS, cell=CELL, origin=origin).patches(PATCH_CELLS)
 
 
 def test_at_the_peak_the_score_is_highest_and_level() -> None:
@@ -372,9 +372,9 @@ def test_whole_shift_of_nothing() -> None:
 
 
 def contrast_of(template: Float32Array, searched: Float32Array, shift: tuple[float, float]) -> float:
-    made = correlate(template, searched, radius=2, cell=16, patch_cells=3)
+    made = multiply(template, searched, radius=2, cell=16).patches(1)
     count = len(made.template_px)
-    return made.contrast(np.tile(shift, (count, 1)), np.ones(count, bool), 9.0)
+    return made.contrast(np.tile(shift, (count, 1)), np.ones(count, bool))
 
 
 def test_contrast_tells_the_right_shift_from_others_and_from_other_pictures() -> None:
@@ -392,10 +392,10 @@ def test_contrast_tells_the_right_shift_from_others_and_from_other_pictures() ->
 
 
 def test_contrast_needs_patches_and_shifts_that_were_tried() -> None:
-    made = correlate(field(0), field(0), radius=2, cell=16, patch_cells=3)
+    made = multiply(field(0), field(0), radius=2, cell=16).patches(1)
     count = len(made.template_px)
     still = np.zeros((count, 2))
     few = np.arange(count) < 19
-    assert made.contrast(still, few, 9.0) == 0.0
-    assert made.contrast(np.full((count, 2), np.inf), np.ones(count, bool), 9.0) == 0.0
-    assert made.contrast(np.full((count, 2), 2.4), np.ones(count, bool), 9.0) == 0.0
+    assert made.contrast(still, few) == 0.0
+    assert made.contrast(np.full((count, 2), np.inf), np.ones(count, bool)) == 0.0
+    assert made.contrast(np.full((count, 2), 2.4), np.ones(count, bool)) == 0.0

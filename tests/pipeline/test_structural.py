@@ -343,13 +343,37 @@ def test_a_heading_far_off_is_found_by_narrower_priors() -> None:
 
 
 def test_features_take_over_where_structure_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Tracking, "run", lambda *_: None)
+    monkeypatch.setattr(Tracking, "run", lambda *_, **__: None)
     frame = rendered.frame(NADIR)
     assert_rejected(localize(frame, TURNED_AWAY), Reason.FEW_MATCHES)
     fix = assert_near(localize(frame, TURNED_AWAY, Structural(acquire=rendered.sift())), NADIR)
     # It was SIFT: only there is AdHoP.
     assert fix.adhop_accepted is not None
     assert "adhop" in fix.timings_ms
+
+
+def test_what_features_found_is_refined_by_structure(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The prediction alone leads nowhere; SIFT's pose does, and the outcome is structure's, without AdHoP."""
+    monkeypatch.setattr(Tracking, "_best", lambda *_: None)
+    frame, both = rendered.frame(NADIR), Structural(acquire=rendered.sift())
+    fix = assert_near(localize(frame, TURNED_AWAY, both), NADIR)
+    assert fix.adhop_accepted is None
+    assert "refine" in fix.timings_ms
+    assert "adhop" not in fix.timings_ms
+    exact = assert_near(localize(frame, rendered.prior(NADIR), both), NADIR)
+    off = fix.map_from_camera.translation - exact.map_from_camera.translation
+    assert np.linalg.norm(off) < 0.1
+    # Judged by the prediction: with one that excludes where features found it, it is no fix.
+    elsewhere = rendered.prior(NADIR, (0.0, 0.0, 30.0), sigma_m=(4.0, 1.0))
+    assert_rejected(localize(frame, elsewhere, both), Reason.PRIOR_DISAGREES, Reason.FEW_MATCHES, Reason.FEW_INLIERS)
+
+
+def test_a_refinement_that_fails_leaves_what_features_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Tracking, "_best", lambda *_: None)
+    monkeypatch.setattr(Tracking, "_from", lambda *_: None)
+    fix = assert_near(localize(rendered.frame(NADIR), TURNED_AWAY, Structural(acquire=rendered.sift())), NADIR)
+    assert fix.adhop_accepted is not None
+    assert {"refine", "adhop"} <= set(fix.timings_ms)
 
 
 def test_features_are_not_asked_where_structure_is_enough() -> None:

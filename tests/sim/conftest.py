@@ -8,7 +8,8 @@ from ortholoc_sim.make_demo_pack import DEMO_CRS, DEMO_SOUTH_M, DEMO_UNDULATION_
 from ortholoc_sim.site import Site
 from ortholoc_sim.world import Scene, World, WorldSpec, build_scene, generate
 
-from ortholoc_edge.tiles.georeference import Georeference, derive_offsets
+from ortholoc_edge.tiles.georeference import Georeference
+from ortholoc_edge.tiles.vertical import derive_offsets
 
 # A quarter of a metre: a tenth of the demo's work, the same code.
 SMALL = WorldSpec(seed=5, width_m=320.0, height_m=280.0, gsd_m=0.25)

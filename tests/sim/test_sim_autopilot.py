@@ -27,6 +27,12 @@ os.environ["MAVLINK20"] = "1"
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from ortholoc_edge.adapters.mavlink import LinkOptions
+from ortholoc_edge.adapters.mavlink.audit import Level, Situation, audit, parameters_wanted
+from ortholoc_edge.adapters.mavlink.estimates import Autopilot
+from ortholoc_edge.adapters.mavlink.parameters import ParameterClient
+from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol
+
 S = 1_000_000_000
 BOOT = 1000 * S
 OUR_OFFSET = 7_000 * S + 12_345  # the companion's clock minus boot time
@@ -301,3 +307,26 @@ def wait_readable(port: UdpPort) -> None:
 
     while not select.select([port], [], [], 0.05)[0]:
         assert time.monotonic() < deadline
+
+
+def test_its_parameters_are_those_of_a_set_up_for_vision(site: Site) -> None:
+    """Else the daemon would complain of its settings in every simulated flight."""
+    core = AutopilotCore(AutopilotOptions(), site, truth())
+    client = ParameterClient()
+    client.read(parameters_wanted(Autopilot.ARDUPILOT, ("odometry",)))
+    protocol = LinkProtocol(LinkOptions(endpoint="udp:127.0.0.1:1"))
+    now_ns = 0
+    while client.busy:
+        for request in client.poll(now_ns, core.options.system_id, Autopilot.ARDUPILOT):
+            for answer in core.handle(received(request), now_ns):
+                client.on_value(received(answer), Autopilot.ARDUPILOT, now_ns)
+        now_ns += 50_000_000
+    health = protocol.health(now_ns, 0)  # of the link nothing is known, so only parameters are looked at
+    situation = Situation(Autopilot.ARDUPILOT, (4, 5, 7), frozenset({"odometry"}), health, client.readings)
+    wrong = [f.subject for f in audit(situation) if f.level is not Level.NOTE and f.subject.isupper()]
+    assert wrong == [] and situation.value("VISO_TYPE") == 1
+
+
+def received(message):  # type: ignore[no-untyped-def]
+    (decoded,) = dialect.MAVLink(None, 0, 0).parse_buffer(message.pack(dialect.MAVLink(None, 1, 1)))
+    return decoded

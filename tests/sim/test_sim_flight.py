@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from ortholoc_sim import demo_pack_path
-from ortholoc_sim.autopilot import Verdict, dialect
+from ortholoc_sim.autopilot import AutopilotOptions, GimbalOptions, SensorOptions, Verdict, dialect
 from ortholoc_sim.flight import Bench, FlightOptions, draw_track, make_report, run_flight
 from ortholoc_sim.loop import ClosedLoop, LoopOptions
 from ortholoc_sim.site import Site
@@ -19,7 +19,7 @@ from ortholoc_sim.vehicle import Vehicle, VehicleOptions, attitude_of
 from ortholoc_sim.world import WorldSpec
 
 from ortholoc_edge.adapters.camera import EndOfFrames
-from ortholoc_edge.adapters.mavlink import LinkOptions
+from ortholoc_edge.adapters.mavlink import GimbalSelection, LinkOptions
 from ortholoc_edge.adapters.mavlink.codec import FrameParser
 from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol
@@ -63,7 +63,7 @@ def flown(site: Site, seconds: float, *, estimates: bool, seed: int = 1, noise_m
         if estimates and tick % 25 == 0 and truth is not None:
             position = site.autopilot_from_ned(truth.position_ned_m) + rng.normal(0.0, noise_m, 3)
             replies += protocol.encode_estimate(
-                VisionEstimate(taken, position, truth.ned_from_body, np.diag([noise_m**2] * 3 + [1e-4] * 3))
+                VisionEstimate(taken, position, truth.ned_from_body, np.diag([noise_m**2] * 3 + [1e-4] * 3)), now
             )
         for reply in replies:
             for answer in loop.receive(from_us.feed(reply.pack(ours), now), now):
@@ -100,6 +100,42 @@ def test_without_estimates_it_drifts_off(site: Site) -> None:
     # As far as an autopilot without velocity aiding drifts in 55 s.
     assert max(worst) < 80.0
     assert min(worst) > 15.0
+
+
+def test_a_gimbal_on_a_moving_vehicle_is_known_at_the_exposure(site: Site) -> None:
+    """It nods, the vehicle banks, turns and shakes; only the errors that its reports have are left."""
+    gimbal = GimbalOptions(error_deg=(0.3, -0.4), delay_ms=30.0)
+    exact = SensorOptions(tilt_deg=0.0, yaw_bias_deg=0.0, yaw_deg=0.0)
+    options = LoopOptions(route(site), autopilot=AutopilotOptions(sensors=exact, gimbal=gimbal))
+    loop = ClosedLoop(site, options, START)
+    protocol = LinkProtocol(LinkOptions(endpoint="udp:127.0.0.1:1"), GimbalSelection(delay_ns=30_000_000))
+    ours, theirs = dialect.MAVLink(None, 1, 197), dialect.MAVLink(None, 1, 1)
+    from_autopilot, from_us = FrameParser(), FrameParser()
+    off_deg, bank_deg = [], []
+    for tick in range(30 * 50):
+        now = START + tick * S // 50
+        replies = [
+            answer
+            for sent in loop.advance(now)
+            for message in from_autopilot.feed(sent.pack(theirs), now)
+            for answer in protocol.on_message(message, now)
+        ]
+        for reply in replies + protocol.poll(now):
+            for answer in loop.receive(from_us.feed(reply.pack(ours), now), now):
+                for message in from_autopilot.feed(answer.pack(theirs), now):
+                    protocol.on_message(message, now)
+        taken = now - round(0.13 * S)
+        truth = loop.truth_at(taken)
+        if tick % 7 == 0 and tick > 150 and truth is not None:
+            state = protocol.state_at(taken)
+            assert state is not None
+            assert state.interpolated
+            assert state.ned_from_gimbal is not None
+            true = gimbal.ned_from_gimbal(truth.ned_from_body, loop.boot_ns(taken))
+            off_deg.append(np.rad2deg(rotation.angle_between(state.ned_from_gimbal, true)))
+            bank_deg.append(np.rad2deg(np.arccos(truth.ned_from_body[2, 2])))
+    assert max(bank_deg) > 8.0
+    assert off_deg == pytest.approx([np.hypot(0.3, 0.4)] * len(off_deg), abs=0.1)
 
 
 def test_same_seed_same_flight(site: Site) -> None:

@@ -2,6 +2,7 @@ import csv
 import subprocess
 import sys
 import textwrap
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import packs
@@ -15,14 +16,9 @@ from ortholoc_edge.errors import ConfigError, MapError
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.frames import ecef_from_geodetic, map_from_ned_rotation, ned_from_ecef_rotation
 from ortholoc_edge.geometry.rigid import Rigid3
-from ortholoc_edge.tiles.georeference import (
-    Georeference,
-    HeightOffsets,
-    LocalFrame,
-    VerticalDatum,
-    datum_shift_caveat,
-    derive_offsets,
-)
+from ortholoc_edge.tiles.georeference import Georeference, HeightOffsets, LocalFrame, VerticalDatum
+from ortholoc_edge.tiles.systems import datum_shift_caveat, require_way_to_wgs84
+from ortholoc_edge.tiles.vertical import derive_offsets
 
 ELLIPSOIDAL = VerticalDatum(kind="ellipsoid", ellipsoid_minus_map_m=0.0, amsl_minus_map_m=-47.5)
 UNKNOWN = VerticalDatum(kind="unknown")
@@ -71,6 +67,55 @@ def test_convergence_is_the_turn_from_a_geodesic_north_to_grid_north(crs, lat, l
     # And the rotation that the geometry builds of it.
     turned = map_from_ned_rotation(convergence) @ (1.0, 0.0, 0.0)
     assert np.allclose(turned[:2], (north - south)[:2] / np.hypot(east, up), atol=1.5e-5)
+
+
+@pytest.mark.parametrize(("crs", "lat", "lon"), PLACES)
+def test_scale_convergence_and_position_agree_with_pyproj(crs, lat, lon):
+    reference = georeference(crs, lat, lon)
+    factors = pyproj.Proj(crs).get_factors(lon, lat)
+    # The factors are those on the system's own ellipsoid; a datum shift (CH1903+: 2 arc seconds) is not in them. Beside
+    # it there are the differences' rounding and curvature, 1e-9, and a hundred times that is asked.
+    shifted = crs == "EPSG:2056"
+    convergence = np.deg2rad(factors.meridian_convergence)
+    assert reference.convergence_rad(reference.anchor) == pytest.approx(convergence, abs=1.5e-5 if shifted else 1e-7)
+    scale = np.sqrt(factors.meridional_scale * factors.parallel_scale)
+    assert reference.grid_scale(reference.anchor, 0.0) == pytest.approx(scale, rel=1.5e-5 if shifted else 1e-7)
+    lon_lat = pyproj.Transformer.from_crs(crs, "EPSG:4326", always_xy=True).transform(*reference.anchor)
+    at = reference.geodetic_from_map((*reference.anchor, 0.0))
+    # 1e-8 degrees are a millimetre.
+    assert (at.lon_deg, at.lat_deg) == pytest.approx(lon_lat, abs=1e-8)
+
+
+def test_every_position_without_an_image_is_an_error_and_the_next_one_is_not():
+    """GDAL stops reporting after twenty failures of one transformation."""
+    reference = georeference("EPSG:32633", 48.0, 15.0)
+    for _ in range(30):
+        with pytest.raises(MapError, match="outside the domain"):
+            reference.geodetic_from_map((1e9, 1e9, 0.0))
+        with pytest.raises(MapError, match="outside the domain"):
+            reference.map_from_geodetic(91.0, 15.0, height_amsl_m=0.0)
+        with pytest.raises(MapError, match="outside the domain"):
+            reference.convergence_rad((np.nan, 5e6))
+    assert reference.geodetic_from_map((500_000.0, 5_000_000.0, 0.0)).lon_deg == pytest.approx(15.0)
+
+
+def test_several_threads_get_the_same_positions():
+    reference = georeference("EPSG:32633", 48.0, 15.0)
+    places = [(400_000.0 + 1000.0 * k, 5_300_000.0 + 500.0 * k) for k in range(100)]
+    alone = [(reference.geodetic_from_map((*at, 0.0)), reference.convergence_rad(at)) for at in places]
+    with ThreadPoolExecutor(4) as pool:
+        many = list(
+            pool.map(lambda at: (reference.geodetic_from_map((*at, 0.0)), reference.convergence_rad(at)), places * 4)
+        )
+    assert many == alone * 4
+
+
+def test_a_datum_that_nobody_knows_is_refused_by_a_build():
+    """GDAL would take it for WGS 84."""
+    crs = "+proj=utm +zone=33 +a=6378000 +b=6356000 +units=m +type=crs"
+    with pytest.raises(MapError, match=r"no way to WGS 84.*EPSG:32633"):
+        require_way_to_wgs84(crs, (45.0, 15.0))
+    require_way_to_wgs84("EPSG:31467", (49.6, 9.0))
 
 
 @pytest.mark.parametrize("name", ["seneca", "caliterra", "copr"])
@@ -279,7 +324,7 @@ def test_geoid_grid_is_used_where_proj_has_it(tmp_path):
     import numpy as np, pyproj.datadir, rasterio
     from affine import Affine
     from ortholoc_edge.errors import ConfigError
-    from ortholoc_edge.tiles.georeference import derive_offsets
+    from ortholoc_edge.tiles.vertical import derive_offsets
 
     def derive_vertical(kind, epsg, undulation_m, place):
         return derive_offsets(kind, epsg, undulation_m, [place])[0]

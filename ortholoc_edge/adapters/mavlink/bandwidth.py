@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from ortholoc_edge.adapters.mavlink import gimbal
 from ortholoc_edge.adapters.mavlink.codec import dialect
 from ortholoc_edge.adapters.mavlink.estimates import Autopilot
 from ortholoc_edge.adapters.mavlink.options import Endpoint, LinkOptions
@@ -131,7 +132,7 @@ def total_bytes_per_s(shares: Iterable[Share]) -> float:
     return sum(share.bytes_per_s for share in shares)
 
 
-def plan_line(options: LinkOptions, endpoint: Endpoint) -> LinePlan:
+def plan_line(options: LinkOptions, endpoint: Endpoint, *, has_gimbal: bool = False) -> LinePlan:
     """What ``options`` make of the line, if all goes at its full rate and length.
 
     While the autopilot is not known ("auto") it is taken for a PX4, which says more. What an autopilot sends unasked
@@ -149,7 +150,8 @@ def plan_line(options: LinkOptions, endpoint: Endpoint) -> LinePlan:
     timesync = share("TIMESYNC", _TIMESYNC_OWN_HZ + _TIMESYNC_ASKED_HZ[autopilot])
     estimates = [
         share(name.upper(), options.estimate_rate_hz, "lower estimate_rate_hz or name fewer messages in send")
-        for name in options.send
+        # What "auto" will choose is not known yet; ODOMETRY is the longest of them.
+        for name in (("odometry",) if options.send == ("auto",) else options.send)
     ]
     own = [
         share("ONBOARD_COMPUTER_STATUS", options.computer_status_rate_hz),
@@ -167,6 +169,7 @@ def plan_line(options: LinkOptions, endpoint: Endpoint) -> LinePlan:
         ),
         (
             *(share(name, rate_hz) for name, rate_hz in wanted_rates_hz(options, autopilot).items()),
+            *([share("GIMBAL_DEVICE_ATTITUDE_STATUS", gimbal.RATE_HZ)] if has_gimbal else []),
             share("HEARTBEAT", _HEARTBEAT_HZ),
             timesync,
             share("COMMAND_ACK", _COMMAND_HZ),

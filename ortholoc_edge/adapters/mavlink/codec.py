@@ -24,12 +24,22 @@ if dialect.WIRE_PROTOCOL_VERSION != "2.0":
         f"pymavlink's dialect speaks MAVLink {dialect.WIRE_PROTOCOL_VERSION}; install pymavlink >= 2.4.49"
     )
 
-__all__ = ["FrameParser", "MavlinkMessage", "dialect"]
+__all__ = ["FrameParser", "MavlinkMessage", "dialect", "payload_of"]
 
 # A message object of pymavlink's dialect, which carries no types.
 MavlinkMessage = Any
 
 _MS = 1_000_000
+
+
+def payload_of(message: MavlinkMessage, at_least: int) -> bytes:
+    """The payload as it came, with the zeros at its end that MAVLink 2 cuts off restored to ``at_least`` bytes.
+
+    pymavlink's own `get_payload` takes the header of MAVLink 2 for that of MAVLink 1, and is 4 bytes off.
+    """
+    frame = bytes(message.get_msgbuf())
+    header = 6 if frame[0] == 0xFE else 10
+    return frame[header : header + frame[1]].ljust(at_least, b"\0")
 
 
 class FrameParser:

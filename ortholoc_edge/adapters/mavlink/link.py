@@ -9,20 +9,26 @@ import select
 import socket
 import threading
 from collections import Counter, deque
+from collections.abc import Iterable, Mapping
 from types import TracebackType
 from typing import Any
 
 from ortholoc_edge.adapters.computer import ComputerStatus
 from ortholoc_edge.adapters.mavlink.bandwidth import plan_line
+from ortholoc_edge.adapters.mavlink.census import LinkHealth
 from ortholoc_edge.adapters.mavlink.codec import FrameParser, MavlinkMessage, dialect
-from ortholoc_edge.adapters.mavlink.estimates import GeodeticOrigin, VisionEstimate
+from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate
+from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin
+from ortholoc_edge.adapters.mavlink.gimbal import GimbalSelection
 from ortholoc_edge.adapters.mavlink.log import LimitedLog
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus, parse_endpoint
+from ortholoc_edge.adapters.mavlink.parameters import Number, Reading, Written
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol, Statistic
 from ortholoc_edge.adapters.mavlink.signing import ACCEPTED, STORE_INTERVAL_S, Verdict, make_signing
+from ortholoc_edge.adapters.mavlink.sinks import Sink
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity, AutopilotState
 from ortholoc_edge.adapters.mavlink.transport import Transport, open_transport
-from ortholoc_edge.clock import Clock, unix_ns
+from ortholoc_edge.clock import Clock, wall_clock_ns
 from ortholoc_edge.errors import LinkError
 
 logger = logging.getLogger(__name__)
@@ -34,6 +40,7 @@ _TCP_SILENCE_NS = 10 * _S
 _BACKOFF_MIN_S, _BACKOFF_MAX_S = 0.5, 10.0
 _SELECT_TIMEOUT_S = 0.05
 _GIVE_UP_AFTER_ERRORS = 10
+_CARRY_ESTIMATES = {sink.value.upper() for sink in Sink}
 # For `sys.setswitchinterval`, by who owns the process: how long the link's thread waits at most for a thread that
 # computes in Python. By default 5 ms, each time that it comes back from the kernel.
 SWITCH_INTERVAL_S = 1e-4
@@ -67,14 +74,18 @@ class AutopilotLink:
     again it ends, and :attr:`failure` says why; the daemon should then end too.
     """
 
-    def __init__(self, options: LinkOptions, clock: Clock) -> None:
-        """Raises: ConfigError if the endpoint can't be understood, a serial line can't carry what is asked of it, or
-        the signing key can't be used."""
+    def __init__(self, options: LinkOptions, clock: Clock, gimbal: GimbalSelection | None = None) -> None:
+        """
+        Args:
+            gimbal: the one that carries the camera; None: a fixed mount.
+        Raises: ConfigError if the endpoint can't be understood, a serial line can't carry what is asked of it, or the
+            signing key can't be used.
+        """
         self._endpoint = parse_endpoint(options.endpoint)
-        self._plan = plan_line(options, self._endpoint)
+        self._plan = plan_line(options, self._endpoint, has_gimbal=gimbal is not None)
         self._plan.require_fit()
         self._options, self._clock = options, clock
-        self._protocol = LinkProtocol(options)
+        self._protocol = LinkProtocol(options, gimbal)
         self._mav = dialect.MAVLink(None, 0, options.component_id)
         self._signing = make_signing(options, os.environ)
         if self._signing is not None:
@@ -86,6 +97,7 @@ class AutopilotLink:
         self._transport: Transport | None = None
         self._wake_pair: tuple[socket.socket, socket.socket] | None = None
         self._estimate: VisionEstimate | None = None
+        self._recovery = False
         self._texts: deque[MavlinkMessage] = deque(maxlen=16)
         self._text_id = 0
         self._log = LimitedLog()
@@ -119,7 +131,7 @@ class AutopilotLink:
         if (warning := self._plan.timesync_warning()) is not None:
             logger.warning("%s", warning)
         if self._signing is not None:
-            self._signing.start(self._clock.now_ns(), unix_ns())
+            self._signing.start(self._clock.now_ns(), wall_clock_ns())
         if open_now:
             try:
                 self._transport = open_transport(self._endpoint)
@@ -182,12 +194,24 @@ class AutopilotLink:
         with self._lock:
             return self._protocol.state_at(stamp_ns)
 
-    def send_estimate(self, estimate: VisionEstimate) -> None:
-        """Hand an estimate over. One that was not sent yet is replaced and counted: newer is better."""
+    @property
+    def sinks(self) -> tuple[Sink, ...]:
+        """The messages that carry estimates to the autopilot found; empty before it was found."""
+        with self._lock:
+            return self._protocol.sinks
+
+    def send_estimate(self, estimate: VisionEstimate, recovery: bool = False) -> None:
+        """Hand an estimate over. One that was not sent yet is replaced and counted: newer is better.
+
+        Args:
+            recovery: the first one after an outage; told as such with the next that is sent, if
+                ``options.recovery`` allows it.
+        """
         with self._lock:
             if self._estimate is not None:
                 self._counts["estimates_dropped"] += 1
             self._estimate = estimate
+            self._recovery |= recovery
         self._wake()
 
     def send_status_text(self, severity: Severity, text: str) -> None:
@@ -228,6 +252,38 @@ class AutopilotLink:
         """
         with self._lock:
             self._protocol.offer_origin(origin)
+
+    def read_parameters(self, names: Iterable[str]) -> None:
+        """Ask the autopilot for these; :meth:`parameters` tells what came. Before one was found they wait.
+
+        Raises: ValueError for a name that MAVLink can't carry.
+        """
+        with self._lock:
+            self._protocol.parameters.read(names)
+
+    def write_parameter(self, name: str, value: Number) -> None:
+        """Set one that was read; :meth:`written_parameters` tells the outcome. One at a time.
+
+        Raises: ValueError if it was not read, another is being set, or its type can't hold the value.
+        """
+        with self._lock:
+            self._protocol.parameters.write(name, value)
+
+    def parameters(self) -> tuple[Mapping[str, Reading], bool]:
+        """What was asked for, as far as it is known; and whether all questions and changes are settled."""
+        with self._lock:
+            return self._protocol.parameters.readings, not self._protocol.parameters.busy
+
+    def written_parameters(self) -> list[Written]:
+        """Changes that came to an end since the last call."""
+        with self._lock:
+            return self._protocol.parameters.take_written()
+
+    def health(self) -> LinkHealth:
+        """Who is on the link and how well it carries."""
+        with self._lock:
+            bad_bytes = self._retired["bad_bytes"] + sum(p.bad_bytes for p in self._parsers.values())
+            return self._protocol.health(self._clock.now_ns(), bad_bytes)
 
     def statistics(self) -> dict[str, Statistic]:
         """Counters since the start, flat: ``sent.NAME``, ``received.NAME``, ``bad_frames``, ``reconnects``
@@ -384,7 +440,7 @@ class AutopilotLink:
         if self._signing is None:
             return True
         now_ns = self._clock.now_ns()
-        verdict = self._signing.check(message, now_ns, unix_ns())
+        verdict = self._signing.check(message, now_ns, wall_clock_ns())
         if verdict in ACCEPTED:
             return True
         self._counts[verdict.value] += 1
@@ -406,8 +462,12 @@ class AutopilotLink:
             # While bytes wait, an estimate stays in its slot, where a newer one can still replace it.
             if self._estimate is not None and not transport.pending():
                 estimate, self._estimate = self._estimate, None
-                encoded = self._protocol.encode_estimate(estimate) if self._protocol.connected(now_ns) else []
+                encoded = []
+                if self._protocol.connected(now_ns):
+                    wall_ns = wall_clock_ns()
+                    encoded = self._protocol.encode_estimate(estimate, now_ns, wall_ns, self._recovery)
                 if encoded:
+                    self._recovery = False
                     self._protocol.sent_estimate = estimate
                 else:
                     self._counts["estimates_dropped"] += 1
@@ -420,7 +480,7 @@ class AutopilotLink:
     def _send(self, transport: Transport, message: MavlinkMessage) -> None:
         self._mav.srcSystem = self._protocol.own_system_id
         if self._signing is not None:
-            self._signing.sign_next(self._mav, self._clock.now_ns(), unix_ns())
+            self._signing.sign_next(self._mav, self._clock.now_ns(), wall_clock_ns())
         frame = bytes(message.pack(self._mav))
         if transport.send(frame):
             self._mav.seq = (self._mav.seq + 1) % 256
@@ -428,5 +488,5 @@ class AutopilotLink:
             self._counts[f"sent_bytes.{message.get_type()}"] += len(frame)
         else:
             self._counts["unsent"] += 1
-            if message.get_type() in ("ODOMETRY", "VISION_POSITION_ESTIMATE"):
+            if message.get_type() in _CARRY_ESTIMATES:
                 self._counts["estimates_dropped"] += 1

@@ -41,7 +41,10 @@ class LinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         system_id: ours and the vehicle's (a component shares the system id of its vehicle); 0 adopts that of
             the first autopilot heard.
         component_id: 197 is MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY.
-        send: which messages carry an estimate.
+        send: which messages carry an estimate; "auto" alone takes the best that the autopilot's firmware reads.
+        sensor_id: ours in GLOBAL_POSITION_SENSOR; PX4 wants it in EKF2_AGPn_ID.
+        recovery: whether the first fix after an outage also goes as MAV_CMD_EXTERNAL_POSITION_ESTIMATE, by which a
+            filter that dead reckons sets its position to ours at once.
         autopilot: overrides what the heartbeat says.
         attitude_rate_hz, position_rate_hz: of ATTITUDE_QUATERNION and LOCAL_POSITION_NED, asked of the
             autopilot.
@@ -61,7 +64,11 @@ class LinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     endpoint: str
     system_id: Annotated[int, msgspec.Meta(ge=0, le=255)] = 0
     component_id: Annotated[int, msgspec.Meta(ge=1, le=255)] = 197
-    send: tuple[Literal["vision_position_estimate", "odometry"], ...] = ("odometry",)
+    send: tuple[
+        Literal["auto", "odometry", "vision_position_estimate", "global_position_sensor", "gps_input"], ...
+    ] = ("auto",)
+    sensor_id: Annotated[int, msgspec.Meta(ge=1, le=255)] = 1
+    recovery: bool = False
     autopilot: Literal["auto", "ardupilot", "px4"] = "auto"
     attitude_rate_hz: Annotated[float, msgspec.Meta(ge=1, le=400)] = 50.0
     position_rate_hz: Annotated[float, msgspec.Meta(ge=1, le=100)] = 20.0
@@ -73,6 +80,12 @@ class LinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     signing_link_id: Annotated[int, msgspec.Meta(ge=0, le=255)] = 0
     signing_state: Annotated[str, msgspec.Meta(min_length=1)] | None = None
     require_signed: bool = False
+
+    def __post_init__(self) -> None:
+        if "auto" in self.send and len(self.send) > 1:
+            raise ValueError(f"send = {list(self.send)} mixes auto with names; write either [\"auto\"] or the names")
+        if len(set(self.send)) < len(self.send):
+            raise ValueError(f"send = {list(self.send)} names a message twice")
 
 
 @dataclass(frozen=True, slots=True)

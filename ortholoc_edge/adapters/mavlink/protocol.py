@@ -7,17 +7,16 @@ from collections import Counter
 from collections.abc import Callable
 
 from ortholoc_edge.adapters.computer import ComputerStatus
+from ortholoc_edge.adapters.mavlink.census import Census, LinkHealth
 from ortholoc_edge.adapters.mavlink.codec import MavlinkMessage, dialect
-from ortholoc_edge.adapters.mavlink.estimates import (
-    Autopilot,
-    GeodeticOrigin,
-    VisionEstimate,
-    covariance_layout,
-    encode_odometry,
-    encode_vision_position_estimate,
-)
+from ortholoc_edge.adapters.mavlink.estimates import Autopilot, VisionEstimate
+from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin
+from ortholoc_edge.adapters.mavlink.gimbal import GimbalSelection
 from ortholoc_edge.adapters.mavlink.log import LimitedLog
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus
+from ortholoc_edge.adapters.mavlink.outlet import Outlet
+from ortholoc_edge.adapters.mavlink.parameters import ParameterClient
+from ortholoc_edge.adapters.mavlink.sinks import Sink
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity, AutopilotState
 from ortholoc_edge.adapters.mavlink.status import encode_onboard_computer_status, encode_quality
 from ortholoc_edge.adapters.mavlink.streams import Repeat, Stream, wanted_rates_hz
@@ -54,7 +53,7 @@ class LinkProtocol:
     and sends what both return, in order.
     """
 
-    def __init__(self, options: LinkOptions) -> None:
+    def __init__(self, options: LinkOptions, gimbal: GimbalSelection | None = None) -> None:
         self._options = options
         self._log = LimitedLog()
         self.system_status = SystemStatus.BOOT
@@ -62,7 +61,11 @@ class LinkProtocol:
         self.sent_estimate: VisionEstimate | None = None
         self.timesync = TimeSync()
         self.counts: Counter[str] = Counter()
-        self.telemetry = Telemetry(self.timesync, self.counts, options.attitude_rate_hz, options.position_rate_hz)
+        self.telemetry = Telemetry(
+            self.timesync, self.counts, options.attitude_rate_hz, options.position_rate_hz, gimbal
+        )
+        self.parameters = ParameterClient()
+        self._census = Census()
         self._vehicle: AutopilotIdentity | None = None
         self._heartbeat_ns = 0
         self._silent = False
@@ -76,11 +79,14 @@ class LinkProtocol:
         self._home_timer = Repeat(2 * _S, 10 * _S)
         self._computer_timer = _repeat_at(options.computer_status_rate_hz)
         self._quality_timer = _repeat_at(options.quality_rate_hz)
+        self._outlet = Outlet(options, self.counts, self._log)
         self._handlers: dict[str, Callable[[MavlinkMessage, int], None]] = {
             "HOME_POSITION": self._on_home,
             "AUTOPILOT_VERSION": self._on_version,
             "STATUSTEXT": self._on_status_text,
             "COMMAND_ACK": self._on_command_ack,
+            "PARAM_VALUE": self._on_parameter,
+            "PARAM_ERROR": lambda m, arrival_ns: self.parameters.on_error(m),
             "TIMESYNC": lambda m, arrival_ns: self.timesync.answered(m.tc1, m.ts1, arrival_ns),
         }
 
@@ -108,6 +114,7 @@ class LinkProtocol:
         """Take in one message; returns what must be answered at once."""
         system, component = message.get_srcSystem(), message.get_srcComponent()
         name = message.get_type()
+        self._census.take(message)
         if system == self.own_system_id and component == self._options.component_id:
             self.counts["own_echo"] += 1
             return []
@@ -115,9 +122,12 @@ class LinkProtocol:
             self._on_heartbeat(message, system, arrival_ns)
             return []
         if self._vehicle is None or (system, component) != (self._vehicle.system_id, _AUTOPILOT_COMPONENT):
-            self.counts["ignored"] += 1
+            ours = self._vehicle is not None and system == self._vehicle.system_id
+            taken = ours and self.telemetry.take_of_component(message, arrival_ns)
+            self.counts[f"received.{name}" if taken else "ignored"] += 1
             return []
         self.counts[f"received.{name}"] += 1
+        self._census.take_vehicles(name, arrival_ns)
         if name in self._streams:
             self._streams[name].heard(arrival_ns)
         if name == "TIMESYNC" and message.tc1 == 0:
@@ -202,6 +212,8 @@ class LinkProtocol:
             stream.restart()
         for timer in (self._version_timer, self._origin_timer, self._home_timer):
             timer.restart()
+        self.parameters.restart()
+        self._census.restart()
 
     def _on_home(self, m: MavlinkMessage, arrival_ns: int) -> None:
         self._home_known = True
@@ -224,6 +236,10 @@ class LinkProtocol:
     def _on_command_ack(self, m: MavlinkMessage, arrival_ns: int) -> None:
         if m.result not in (dialect.MAV_RESULT_ACCEPTED, dialect.MAV_RESULT_IN_PROGRESS):
             self.counts["commands_refused"] += 1
+
+    def _on_parameter(self, m: MavlinkMessage, arrival_ns: int) -> None:
+        if self._vehicle is not None:
+            self.parameters.on_value(m, self._vehicle.autopilot, arrival_ns)
 
     # -- out --------------------
 
@@ -254,7 +270,10 @@ class LinkProtocol:
         ts1 = self.timesync.due(now_ns)
         if ts1 is not None:
             out.append(dialect.MAVLink_timesync_message(tc1=0, ts1=ts1))
-        if vehicle.firmware_version is None and self._version_timer.due(now_ns):
+        if vehicle.firmware_version is not None:
+            # What is doubtful about the choice is told before the first estimate.
+            self._outlet.sinks(vehicle)
+        elif self._version_timer.due(now_ns):
             out.append(self._request(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION))
         if (self._origin_timer if self.telemetry.origin is None else self._origin_watch_timer).due(now_ns):
             out.append(self._request(dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN))
@@ -263,30 +282,45 @@ class LinkProtocol:
                 out.append(self._set_origin(vehicle.system_id, self._offered_origin))
         if not self._home_known and self._home_timer.due(now_ns):
             out.append(self._request(dialect.MAVLINK_MSG_ID_HOME_POSITION))
+        out += self._about_us(now_ns)
+        out += [
+            self._command(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, stream.message_id, stream.interval_ns / 1e3)
+            for stream in self._streams.values()
+            if stream.due(now_ns)
+        ]
+        if self.telemetry.gimbal is not None:
+            out += [
+                self._command(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_ns / 1e3, component)
+                for component, message_id, interval_ns in self.telemetry.gimbal.requests(now_ns)
+            ]
+        out += self.parameters.poll(now_ns, vehicle.system_id, vehicle.autopilot)
+        return out
+
+    def _about_us(self, now_ns: int) -> list[MavlinkMessage]:
+        out: list[MavlinkMessage] = []
         # Each reading once: of a worker that hangs, the last one would look alive.
         if self.computer is not None and self._computer_timer is not None and self._computer_timer.due(now_ns):
             out.append(encode_onboard_computer_status(self.computer, now_ns))
             self.computer = None
         if self.sent_estimate is not None and self._quality_timer is not None and self._quality_timer.due(now_ns):
             out += encode_quality(self.sent_estimate, now_ns)
-        out += [
-            self._command(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, stream.message_id, stream.interval_ns / 1e3)
-            for stream in self._streams.values()
-            if stream.due(now_ns)
-        ]
         return out
 
-    def encode_estimate(self, estimate: VisionEstimate) -> list[MavlinkMessage]:
-        """The messages for an estimate, in the form that the autopilot found reads; none before it was
-        found."""
+    @property
+    def sinks(self) -> tuple[Sink, ...]:
+        """What carries estimates to the autopilot found; empty before it was found."""
+        return () if self._vehicle is None else self._outlet.sinks(self._vehicle)
+
+    def encode_estimate(
+        self, estimate: VisionEstimate, now_ns: int, wall_ns: int = 0, recovery: bool = False
+    ) -> list[MavlinkMessage]:
+        """The messages for an estimate, in the form that the autopilot found reads; none before it was found.
+
+        See :meth:`Outlet.encode`.
+        """
         if self._vehicle is None:
             return []
-        layout = covariance_layout(self._vehicle.autopilot, self._vehicle.firmware_version)
-        encoders = {
-            "vision_position_estimate": encode_vision_position_estimate,
-            "odometry": encode_odometry,
-        }
-        return [encoders[name](estimate, layout) for name in self._options.send]
+        return self._outlet.encode(estimate, self._vehicle, self.telemetry.origin, now_ns, wall_ns, recovery)
 
     def offer_origin(self, origin: GeodeticOrigin) -> None:
         """See :meth:`AutopilotLink.offer_origin`."""
@@ -295,10 +329,12 @@ class LinkProtocol:
     def _request(self, message_id: int) -> MavlinkMessage:
         return self._command(dialect.MAV_CMD_REQUEST_MESSAGE, message_id)
 
-    def _command(self, command: int, param1: float, param2: float = 0.0) -> MavlinkMessage:
+    def _command(
+        self, command: int, param1: float, param2: float = 0.0, component: int = _AUTOPILOT_COMPONENT
+    ) -> MavlinkMessage:
         return dialect.MAVLink_command_long_message(
             target_system=self._vehicle.system_id if self._vehicle else 0,
-            target_component=_AUTOPILOT_COMPONENT,
+            target_component=component,
             command=command,
             confirmation=0,
             param1=float(param1),
@@ -325,6 +361,26 @@ class LinkProtocol:
         """See :meth:`AutopilotLink.state_at`."""
         return self.telemetry.state_at(stamp_ns) if self._vehicle is not None else None
 
+    def health(self, now_ns: int, bad_bytes: int) -> LinkHealth:
+        """See :meth:`AutopilotLink.health`."""
+        round_trip_ns = self.timesync.median_round_trip_ns
+        return LinkHealth(
+            peers=self._census.peers,
+            vehicle=self._vehicle,
+            connected=self.connected(now_ns),
+            wanted_system_id=self._options.system_id,
+            own_id_heard=self.counts["own_echo"] > 0,
+            mavlink1=self._census.mavlink1,
+            mavlink2=self._census.mavlink2,
+            bad_bytes=bad_bytes,
+            rates_hz=self._census.rates_hz(now_ns),
+            wanted_rates_hz={name: _S / stream.interval_ns for name, stream in self._streams.items()},
+            round_trip_ms=None if round_trip_ns is None else round_trip_ns / _MS,
+            synchronised=self.timesync.synchronised,
+            origin=self.telemetry.origin,
+            set_origin=self._options.set_origin,
+        )
+
     def statistics(self, now_ns: int) -> dict[str, Statistic]:
         """Counters and the state of synchronisation."""
         best = self.timesync.best(now_ns)
@@ -337,6 +393,7 @@ class LinkProtocol:
             "autopilot": vehicle.autopilot.value if vehicle else None,
             "vehicle_system_id": vehicle.system_id if vehicle else None,
             "firmware": ".".join(map(str, version)) if version else None,
+            "gimbal": None if self.telemetry.gimbal is None else str(self.telemetry.gimbal),
             "origin_known": self.telemetry.origin is not None,
             "local_epoch": self.telemetry.local_epoch,
             "synchronised": self.timesync.synchronised,

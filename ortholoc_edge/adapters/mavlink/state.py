@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ortholoc_edge.adapters.mavlink.estimates import Autopilot, GeodeticOrigin
+from ortholoc_edge.adapters.mavlink.estimates import Autopilot
+from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin
 from ortholoc_edge.geometry.arrays import FloatArray
 
 
@@ -35,8 +36,8 @@ class AutopilotState:
 
     Attributes:
         ned_from_body: (3, 3); None without an attitude within 0.2 s of the stamp.
-        interpolated: whether ``ned_from_body`` lies between two samples received; if not it was carried on by
-            the rates, and asking again a little later gives a better one.
+        interpolated: whether ``ned_from_body``, and where it is known ``ned_from_gimbal``, lies between two samples
+            received; if not it was carried on, and asking again a little later gives a better one.
         velocity_ned, local_position_ned_m: (3,) of LOCAL_POSITION_NED, relative to the EKF origin.
         local_epoch: rises when the local position jumped, its stream had a gap, the origin moved or the
             autopilot restarted. Positions of two epochs must not be subtracted.
@@ -52,6 +53,9 @@ class AutopilotState:
             the link's delay. sync_uncertainty_ns: half the round trip plus drift; None if not synchronised.
         estimator_flags, position_test_ratio: of EKF_STATUS_REPORT (ArduPilot) or ESTIMATOR_STATUS (PX4); a
             ratio above 1 means that the filter refuses position measurements.
+        ned_from_gimbal: (3, 3) of the gimbal's axes, forward along the line of sight; None where no gimbal was
+            asked for, or its attitude at the stamp is not known.
+        gimbal_sigma_rad: 1-sigma of what it may have turned in the time by which its reports miss the stamp.
     """
 
     stamp_ns: int
@@ -70,3 +74,5 @@ class AutopilotState:
     sync_uncertainty_ns: int | None
     estimator_flags: int | None
     position_test_ratio: float | None
+    ned_from_gimbal: FloatArray | None = None
+    gimbal_sigma_rad: float = 0.0

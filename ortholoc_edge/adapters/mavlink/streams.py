@@ -37,6 +37,11 @@ class Stream:
         self._count = 0
         self._count_since_ns = 0
 
+    @property
+    def attempts(self) -> int:
+        """How often in a row it was asked for again in vain."""
+        return self._attempts
+
     def heard(self, now_ns: int) -> None:
         self._heard_ns = now_ns
         self._count += 1

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ortholoc_edge.adapters.mavlink.codec import MavlinkMessage, dialect
-from ortholoc_edge.adapters.mavlink.estimates import GeodeticOrigin, moved
+from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin, moved
+from ortholoc_edge.adapters.mavlink.gimbal import GIMBAL_MESSAGES, Gimbal, GimbalSelection
 from ortholoc_edge.adapters.mavlink.history import TimeHistory, choose
 from ortholoc_edge.adapters.mavlink.log import LimitedLog
 from ortholoc_edge.adapters.mavlink.state import AutopilotState, GnssPosition
@@ -106,15 +107,22 @@ class Telemetry:
     """
 
     def __init__(
-        self, timesync: TimeSync, counts: Counter[str], attitude_rate_hz: float, position_rate_hz: float
+        self,
+        timesync: TimeSync,
+        counts: Counter[str],
+        attitude_rate_hz: float,
+        position_rate_hz: float,
+        gimbal: GimbalSelection | None = None,
     ) -> None:
         """
         Args:
             timesync: relates the autopilot's stamps to ours; kept by the owner, which also resets it.
             counts: where what is dropped is counted.
             attitude_rate_hz, position_rate_hz: at which samples are expected, for the memory they take.
+            gimbal: the one that carries the camera; None: nothing of gimbals is taken in.
         """
         self._timesync, self._counts = timesync, counts
+        self.gimbal = None if gimbal is None else Gimbal(gimbal, counts)
         self._log = LimitedLog()
         self._restart: str | None = None
         self._armed = False
@@ -146,6 +154,8 @@ class Telemetry:
             "EKF_STATUS_REPORT": self._on_ekf_status,
             "ESTIMATOR_STATUS": self._on_estimator_status,
         }
+        if self.gimbal is not None:
+            self._handlers |= dict.fromkeys(GIMBAL_MESSAGES, self._on_gimbal)
 
     @property
     def origin(self) -> GeodeticOrigin | None:
@@ -179,6 +189,16 @@ class Telemetry:
         self._estimator = None
         self._landed = None
         self._quaternion_ns = None
+        if self.gimbal is not None:
+            self.gimbal.forget()
+
+    def take_of_component(self, message: MavlinkMessage, arrival_ns: int) -> bool:
+        """Take in a message of another component of the vehicle; False if it is of no use. Such a component counts
+        time from its own start."""
+        if self.gimbal is None or message.get_type() not in GIMBAL_MESSAGES:
+            return False
+        self.gimbal.take(message, None, arrival_ns)
+        return True
 
     def state_at(self, stamp_ns: int) -> AutopilotState:
         """What the autopilot knew at a stamp of our clock; parts that are not known there are None."""
@@ -188,10 +208,11 @@ class Telemetry:
         attitude, interpolated = self._attitude_at(time_ns, by_boot)
         position, velocity, epoch = self._local_at(time_ns, by_boot)
         odometry, odometry_epoch = self._odometry_at(time_ns, by_boot)
+        gimbal = None if self.gimbal is None else self.gimbal.at(stamp_ns, best[0] if best else None, attitude)
         return AutopilotState(
             stamp_ns=stamp_ns,
             ned_from_body=attitude,
-            interpolated=interpolated,
+            interpolated=interpolated and (gimbal is None or gimbal.interpolated),
             velocity_ned=velocity,
             local_position_ned_m=position,
             local_epoch=epoch,
@@ -205,6 +226,8 @@ class Telemetry:
             sync_uncertainty_ns=best[1] if best is not None else None,
             estimator_flags=self._estimator[0] if self._estimator else None,
             position_test_ratio=self._estimator[1] if self._estimator else None,
+            ned_from_gimbal=None if gimbal is None else gimbal.ned_from_gimbal,
+            gimbal_sigma_rad=0.0 if gimbal is None else gimbal.sigma_rad,
         )
 
     # -- in --------------------
@@ -412,6 +435,13 @@ class Telemetry:
 
     def _on_estimator_status(self, m: MavlinkMessage, arrival_ns: int) -> None:
         self._estimator = (m.flags, float(m.pos_horiz_ratio))
+
+    def _on_gimbal(self, m: MavlinkMessage, arrival_ns: int) -> None:
+        assert self.gimbal is not None
+        # Some firmware leaves the stamp of MOUNT_ORIENTATION out.
+        boot_ns = self._boot_ns(m.time_boot_ms, arrival_ns) if m.time_boot_ms else None
+        if boot_ns is not None or not m.time_boot_ms:
+            self.gimbal.take(m, boot_ns, arrival_ns)
 
     # -- at a stamp --------------------
 

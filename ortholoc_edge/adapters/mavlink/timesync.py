@@ -42,6 +42,12 @@ class TimeSync:
     def synchronised(self) -> bool:
         return len(self._samples) >= self._SAMPLES_NEEDED
 
+    @property
+    def median_round_trip_ns(self) -> int | None:
+        """Of the samples kept; None without one."""
+        round_trips = sorted(round_trip for _, round_trip, _ in self._samples)
+        return round_trips[len(round_trips) // 2] if round_trips else None
+
     def due(self, now_ns: int) -> int | None:
         """The ts1 of a request to send now, or None."""
         if now_ns < self._next_ns:
