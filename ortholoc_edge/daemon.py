@@ -21,6 +21,7 @@ from typing import Generic, TypeVar
 from ortholoc_edge.adapters import systemd
 from ortholoc_edge.adapters.bus import AutopilotRecord, Bus
 from ortholoc_edge.adapters.camera import BadFrameError, EndOfFrames, FrameSource, open_source
+from ortholoc_edge.adapters.computer import ComputerReader
 from ortholoc_edge.adapters.mavlink import (
     AutopilotLink,
     AutopilotState,
@@ -172,6 +173,7 @@ class Daemon:
             self._frames = resources.enter_context(closing(frames or open_source(config.camera, self._clock)))
             self._resources = resources.pop_all()
         self._slot: LatestSlot[Frame | _Missed] = LatestSlot()
+        self._computer = ComputerReader()
         self._ended = threading.Event()
         self._capture_failure: BaseException | None = None
         self._capture_beat_ns = self._clock.now_ns()
@@ -436,6 +438,7 @@ class Daemon:
         if not fresh and status is TrackerStatus.TRACK:
             status = TrackerStatus.COAST
         self._link.set_system_status(SystemStatus.ACTIVE if fresh else SystemStatus.STANDBY)
+        self._link.report_computer(self._computer.read())
         systemd.notify(f"STATUS={status}, {self._counts['fixes']} fixes, {self._counts['rejected']} rejected")
         if self._link.connected():
             self._report_damage()

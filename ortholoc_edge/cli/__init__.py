@@ -16,7 +16,9 @@ EXIT_FAILED = 1
 EXIT_CONFIG = 78  # EX_CONFIG: systemd's RestartPreventExitStatus, a restart can't mend a typo
 
 # Each in the module of its name.
-_COMMANDS = ("sim", "run", "doctor", "replay", "localize", "tiles", "models", "bench", "bench-core", "bench-packs")
+_COMMANDS = (
+    "sim", "run", "doctor", "replay", "localize", "tiles", "models", "bench", "bench-core", "bench-link", "bench-packs",
+)  # fmt: skip
 
 
 def main(argv: Sequence[str] | None = None) -> int:

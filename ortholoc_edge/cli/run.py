@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import signal
+import sys
 import threading
 from pathlib import Path
 
+from ortholoc_edge.adapters.mavlink.link import SWITCH_INTERVAL_S
 from ortholoc_edge.config import read_config
 from ortholoc_edge.daemon import Daemon
 
@@ -23,6 +25,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(args: argparse.Namespace) -> int:
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
     daemon = Daemon(read_config(args.config))
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import struct
+from collections.abc import Callable
 from typing import Any
 
 # Importing a v20 dialect by name needs no variable; whoever imports mavutil after us gets MAVLink 2 by it too.
@@ -53,7 +54,9 @@ class FrameParser:
     # A 280 byte frame takes 49 ms at 57600 baud.
     _INCOMPLETE_LIMIT_NS = 200 * _MS
 
-    def __init__(self) -> None:
+    def __init__(self, accept: Callable[[MavlinkMessage], bool] = lambda message: True) -> None:
+        """``accept``: whether a whole frame counts. One that does not is passed over, with all that it holds."""
+        self._accept = accept
         self._mav = dialect.MAVLink(None, 0, 0)
         self._buffer = bytearray()
         self._since_ns = 0
@@ -88,7 +91,7 @@ class FrameParser:
             else:
                 if isinstance(message, dialect.MAVLink_unknown):
                     self.unknown_frames += 1
-                else:
+                elif self._accept(message):
                     messages.append(message)
                 at = end
         if at > 0 or len(buffer) == len(data):

@@ -34,7 +34,7 @@ AUTOPILOT_COMPONENT = 1
 
 # Gimbal device ids up to this are those that the autopilot speaks for; others are component ids.
 _LAST_OF_AUTOPILOT = 6
-_RATE_HZ = 20.0
+RATE_HZ = 20.0
 _HISTORY_NS = 5 * _S
 _CAPACITY = 500
 # A gimbal quiet for longer than the best one is gone; one of lower rank may take its place.
@@ -127,8 +127,8 @@ class Gimbal:
         self._selection, self._counts = selection, counts
         self._log = LimitedLog()
         self._sources: dict[_Source, _Heard] = {}
-        self._status_stream = Stream(dialect.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS, _RATE_HZ)
-        self._orientation_stream = Stream(dialect.MAVLINK_MSG_ID_MOUNT_ORIENTATION, _RATE_HZ)
+        self._status_stream = Stream(dialect.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS, RATE_HZ)
+        self._orientation_stream = Stream(dialect.MAVLINK_MSG_ID_MOUNT_ORIENTATION, RATE_HZ)
 
     def forget(self) -> None:
         """Drop all that does not survive a restart of the autopilot, and ask again."""

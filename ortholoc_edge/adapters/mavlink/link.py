@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import select
 import socket
 import threading
@@ -12,6 +13,8 @@ from collections.abc import Iterable, Mapping
 from types import TracebackType
 from typing import Any
 
+from ortholoc_edge.adapters.computer import ComputerStatus
+from ortholoc_edge.adapters.mavlink.bandwidth import plan_line
 from ortholoc_edge.adapters.mavlink.census import LinkHealth
 from ortholoc_edge.adapters.mavlink.codec import FrameParser, MavlinkMessage, dialect
 from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate
@@ -23,6 +26,7 @@ from ortholoc_edge.adapters.mavlink.monitor import FusionReport
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus, parse_endpoint
 from ortholoc_edge.adapters.mavlink.parameters import Number, Reading, Written
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol, Statistic
+from ortholoc_edge.adapters.mavlink.signing import ACCEPTED, STORE_INTERVAL_S, Verdict, make_signing
 from ortholoc_edge.adapters.mavlink.sinks import Sink
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity, AutopilotState
 from ortholoc_edge.adapters.mavlink.transport import Transport, open_transport
@@ -39,6 +43,29 @@ _BACKOFF_MIN_S, _BACKOFF_MAX_S = 0.5, 10.0
 _SELECT_TIMEOUT_S = 0.05
 _GIVE_UP_AFTER_ERRORS = 10
 _CARRY_ESTIMATES = {sink.value.upper() for sink in Sink}
+# For `sys.setswitchinterval`, by who owns the process: how long the link's thread waits at most for a thread that
+# computes in Python. By default 5 ms, each time that it comes back from the kernel.
+SWITCH_INTERVAL_S = 1e-4
+_REFUSED = {
+    Verdict.UNSIGNED_REFUSED: "a frame without signature is refused; give its sender the key, or set require_signed "
+    "to false",
+    Verdict.BAD_SIGNATURE: "a frame signed with another key is refused; see that both sides have the same",
+    Verdict.REPLAYED: "a signed frame that is not newer than those before is refused; if this goes on, its sender "
+    "lost its clock",
+    Verdict.TOO_OLD: "a signed frame more than a minute old is refused; its sender's clock, or ours, is wrong",
+}
+
+
+def _take_priority() -> None:
+    """Let this thread run as soon as something arrives, before what computes.
+
+    Linux otherwise lets a thread that is at work finish its slice of about 3 ms, which an answer to TIMESYNC then
+    waits for. Allowed to root and where RLIMIT_RTPRIO is above zero (LimitRTPRIO= of the unit); it goes without.
+    """
+    try:
+        os.sched_setscheduler(threading.get_native_id(), os.SCHED_FIFO, os.sched_param(1))
+    except OSError as error:
+        logger.info("the link's thread has no real-time priority (%s); answers wait for what computes", error.strerror)
 
 
 class AutopilotLink:
@@ -53,12 +80,19 @@ class AutopilotLink:
         """
         Args:
             gimbal: the one that carries the camera; None: a fixed mount.
-        Raises: ConfigError if the endpoint can't be understood.
+        Raises: ConfigError if the endpoint can't be understood, a serial line can't carry what is asked of it, or the
+            signing key can't be used.
         """
         self._endpoint = parse_endpoint(options.endpoint)
+        self._plan = plan_line(options, self._endpoint, has_gimbal=gimbal is not None)
+        self._plan.require_fit()
         self._options, self._clock = options, clock
         self._protocol = LinkProtocol(options, gimbal)
         self._mav = dialect.MAVLink(None, 0, options.component_id)
+        self._signing = make_signing(options, os.environ)
+        if self._signing is not None:
+            self._signing.prepare(self._mav)
+        self._signing_thread: threading.Thread | None = None
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -89,10 +123,16 @@ class AutopilotLink:
 
         Args:
             open_now: open the device here and now instead.
-        Raises: LinkError if ``open_now`` and it can't be opened.
+        Raises: LinkError if ``open_now`` and it can't be opened; ConfigError if signing's stamps can't be stored.
         """
         if self._thread is not None:
             raise RuntimeError("this link was started before; make a new one")
+        for line in self._plan.lines():
+            logger.info("%s", line)
+        if (warning := self._plan.timesync_warning()) is not None:
+            logger.warning("%s", warning)
+        if self._signing is not None:
+            self._signing.start(self._clock.now_ns(), wall_clock_ns())
         if open_now:
             try:
                 self._transport = open_transport(self._endpoint)
@@ -108,6 +148,10 @@ class AutopilotLink:
             target=self._run, args=(receiver,), name="autopilot-link", daemon=True
         )
         self._thread.start()
+        if self._signing is not None:
+            # On its own: a card that takes a second to store a stamp must not hold up an answer to TIMESYNC.
+            self._signing_thread = threading.Thread(target=self._store_stamps, name="signing-stamps", daemon=True)
+            self._signing_thread.start()
 
     def stop(self) -> None:
         """End the thread and close the device. Idempotent."""
@@ -118,6 +162,9 @@ class AutopilotLink:
             if self._thread.is_alive():
                 logger.error("the autopilot link's thread did not end within 5 s; its device stays open")
                 return
+        if self._signing_thread is not None and self._signing is not None:
+            self._signing_thread.join(timeout=5.0)
+            self._signing.finish()
         if self._transport is not None:
             self._transport.close()
             self._transport = None
@@ -226,6 +273,11 @@ class AutopilotLink:
         with self._lock:
             self._protocol.system_status = status
 
+    def report_computer(self, status: ComputerStatus) -> None:
+        """What the next ONBOARD_COMPUTER_STATUS says; each status is told once, at the configured rate."""
+        with self._lock:
+            self._protocol.computer = status
+
     def offer_origin(self, origin: GeodeticOrigin) -> None:
         """Set the EKF origin if the autopilot turns out to have none and ``options.set_origin`` allows it.
 
@@ -290,7 +342,20 @@ class AutopilotLink:
             with contextlib.suppress(OSError):
                 self._wake_pair[1].send(b"\0")
 
+    def _store_stamps(self) -> None:
+        while not self._stop.wait(STORE_INTERVAL_S):
+            try:
+                if self._signing is not None:
+                    self._signing.store()
+            except OSError as error:
+                self._counts["stamps_not_stored"] += 1
+                self._log(
+                    self._clock.now_ns(), logging.ERROR, "stamps",
+                    f"signing's stamps can't be stored: {error}; after a crash the autopilot may refuse our frames",
+                )  # fmt: skip
+
     def _run(self, wake_receiver: socket.socket) -> None:
+        _take_priority()
         try:
             self._connect_and_serve(wake_receiver)
         except BaseException as error:
@@ -396,9 +461,10 @@ class AutopilotLink:
                 # Any host can send us datagrams, each with a parser of its own; the oldest goes.
                 if len(self._parsers) >= 8:
                     self._retire(self._parsers.pop(next(iter(self._parsers))))
-                parser = self._parsers[peer] = FrameParser()
+                parser = self._parsers[peer] = FrameParser(lambda message: self._accepts(transport, message, peer))
         for message in parser.feed(data, now_ns):
             self._counts["messages"] += 1
+            self._counts[f"received_bytes.{message.get_type()}"] += len(message.get_msgbuf())
             with self._lock:
                 answers = self._protocol.on_message(message, now_ns)
                 vehicle = self._protocol.vehicle
@@ -411,6 +477,22 @@ class AutopilotLink:
                 transport.prefer(peer)
             for answer in answers:
                 self._send(transport, answer)
+
+    def _accepts(self, transport: Transport, message: MavlinkMessage, peer: Any) -> bool:
+        """Whether a frame's signature lets it count."""
+        if self._signing is None:
+            return True
+        now_ns = self._clock.now_ns()
+        verdict = self._signing.check(message, now_ns, wall_clock_ns())
+        if verdict in ACCEPTED:
+            return True
+        self._counts[verdict.value] += 1
+        system, component = message.get_srcSystem(), message.get_srcComponent()
+        self._log(now_ns, logging.WARNING, verdict.value, f"{_REFUSED[verdict]} (system {system}, {component})")
+        if verdict is Verdict.TOO_OLD and not self._peer_is_vehicle:
+            # Its clock catches up as soon as it hears a signed frame of ours, for which it must be spoken to.
+            transport.prefer(peer)
+        return False
 
     def _retire(self, parser: FrameParser) -> None:
         for name in ("bad_frames", "bad_bytes", "unknown_frames"):
@@ -441,10 +523,13 @@ class AutopilotLink:
 
     def _send(self, transport: Transport, message: MavlinkMessage) -> None:
         self._mav.srcSystem = self._protocol.own_system_id
+        if self._signing is not None:
+            self._signing.sign_next(self._mav, self._clock.now_ns(), wall_clock_ns())
         frame = bytes(message.pack(self._mav))
         if transport.send(frame):
             self._mav.seq = (self._mav.seq + 1) % 256
             self._counts[f"sent.{message.get_type()}"] += 1
+            self._counts[f"sent_bytes.{message.get_type()}"] += len(frame)
         else:
             self._counts["unsent"] += 1
             if message.get_type() in _CARRY_ESTIMATES:

@@ -51,11 +51,19 @@ class LinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         set_origin: whether `AutopilotLink.offer_origin` may set the EKF origin of an autopilot that has none.
         release: how fixes go out (`release`): carried on to the moment of sending, several times each; each once at
             the same age; or each once as soon as it is there.
-        estimate_rate_hz: of "fast-forward"; 0 is the same as "raw". max_repeat_s: how long it goes on without a new
-            fix.
+        estimate_rate_hz: of "fast-forward"; 0 is the same as "raw". A serial line must have room for it (`bandwidth`).
+            max_repeat_s: how long it goes on without a new fix.
         fixed_latency_ms: the age of "fixed-latency".
         switch_sources: whether we may tell ArduPilot to take another source set (MAV_CMD_SET_EKF_SOURCE_SET) when
             GNSS contradicts vision, and back. vision_source_set, gnss_source_set: n of EK3_SRCn_*.
+        computer_status_rate_hz: of ONBOARD_COMPUTER_STATUS; 0 sends none.
+        quality_rate_hz: of the three NAMED_VALUE_FLOAT about the last estimate; 0 sends none.
+        signing_key: path of MAVLink 2's signing key, or the name of a systemd credential; None signs nothing and
+            checks nothing.
+        signing_link_id: the link's number in our signatures.
+        signing_state: the file where signing's stamps are kept across restarts; None takes systemd's state folder.
+        require_signed: refuse what is not signed, but for RADIO_STATUS. What is signed by another key is refused
+            anyway.
     """
 
     endpoint: str
@@ -77,6 +85,12 @@ class LinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     switch_sources: bool = False
     vision_source_set: Annotated[int, msgspec.Meta(ge=1, le=3)] = 2
     gnss_source_set: Annotated[int, msgspec.Meta(ge=1, le=3)] = 1
+    computer_status_rate_hz: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.2
+    quality_rate_hz: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.5
+    signing_key: Annotated[str, msgspec.Meta(min_length=1)] | None = None
+    signing_link_id: Annotated[int, msgspec.Meta(ge=0, le=255)] = 0
+    signing_state: Annotated[str, msgspec.Meta(min_length=1)] | None = None
+    require_signed: bool = False
 
     def __post_init__(self) -> None:
         if self.switch_sources and self.vision_source_set == self.gnss_source_set:

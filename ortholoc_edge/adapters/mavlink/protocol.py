@@ -6,6 +6,7 @@ import logging
 from collections import Counter
 from collections.abc import Callable
 
+from ortholoc_edge.adapters.computer import ComputerStatus
 from ortholoc_edge.adapters.mavlink.census import Census, LinkHealth
 from ortholoc_edge.adapters.mavlink.codec import MavlinkMessage, dialect
 from ortholoc_edge.adapters.mavlink.estimates import Autopilot, VisionEstimate
@@ -21,7 +22,8 @@ from ortholoc_edge.adapters.mavlink.release import Outgoing, Release
 from ortholoc_edge.adapters.mavlink.sinks import Sink
 from ortholoc_edge.adapters.mavlink.sources import PendingSwitch
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity, AutopilotState
-from ortholoc_edge.adapters.mavlink.streams import Repeat, Stream
+from ortholoc_edge.adapters.mavlink.status import encode_onboard_computer_status, encode_quality
+from ortholoc_edge.adapters.mavlink.streams import Repeat, Stream, wanted_rates_hz
 from ortholoc_edge.adapters.mavlink.telemetry import Telemetry
 from ortholoc_edge.adapters.mavlink.timesync import TimeSync
 
@@ -44,6 +46,10 @@ _SILENT_AFTER_NS = 3 * _S
 _REPLACE_AFTER_NS = 10 * _S
 
 
+def _repeat_at(rate_hz: float) -> Repeat | None:
+    return Repeat(int(_S / rate_hz)) if rate_hz > 0 else None
+
+
 class LinkProtocol:
     """What is said and asked, and to whom; what was heard of the vehicle is kept by its ``telemetry``.
 
@@ -55,6 +61,8 @@ class LinkProtocol:
         self._options = options
         self._log = LimitedLog()
         self.system_status = SystemStatus.BOOT
+        self.computer: ComputerStatus | None = None
+        self.sent_estimate: VisionEstimate | None = None
         self.timesync = TimeSync()
         self.counts: Counter[str] = Counter()
         self.telemetry = Telemetry(
@@ -80,6 +88,8 @@ class LinkProtocol:
         self._home_timer = Repeat(2 * _S, 10 * _S)
         self._monitor_timer = Repeat(_S // 2)
         self._advice_timer = Repeat(60 * _S)
+        self._computer_timer = _repeat_at(options.computer_status_rate_hz)
+        self._quality_timer = _repeat_at(options.quality_rate_hz)
         self._outlet = Outlet(options, self.counts, self._log)
         self._handlers: dict[str, Callable[[MavlinkMessage, int], None]] = {
             "HOME_POSITION": self._on_home,
@@ -196,17 +206,9 @@ class LinkProtocol:
         self.telemetry.take(message, arrival_ns)
 
     def _wanted_streams(self, autopilot: Autopilot) -> dict[str, Stream]:
-        rates = {
-            "ATTITUDE_QUATERNION": self._options.attitude_rate_hz,
-            "LOCAL_POSITION_NED": self._options.position_rate_hz,
-            "GPS_RAW_INT": 2.0,
-            "SYSTEM_TIME": 1.0,
-            "EXTENDED_SYS_STATE": 1.0,
-            "EKF_STATUS_REPORT" if autopilot is Autopilot.ARDUPILOT else "ESTIMATOR_STATUS": 2.0,
-        }
         return {
             name: Stream(getattr(dialect, f"MAVLINK_MSG_ID_{name}"), rate_hz)
-            for name, rate_hz in rates.items()
+            for name, rate_hz in wanted_rates_hz(self._options, autopilot).items()
         }
 
     def _start_over(self, why: str, now_ns: int) -> None:
@@ -296,6 +298,7 @@ class LinkProtocol:
                 out.append(self._set_origin(vehicle.system_id, self._offered_origin))
         if not self._home_known and self._home_timer.due(now_ns):
             out.append(self._request(dialect.MAVLINK_MSG_ID_HOME_POSITION))
+        out += self._about_us(now_ns)
         out += [
             self._command(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, stream.message_id, stream.interval_ns / 1e3)
             for stream in self._streams.values()
@@ -321,6 +324,7 @@ class LinkProtocol:
 
     def sent(self, outgoing: Outgoing, now_ns: int) -> None:
         """An estimate was handed to the line."""
+        self.sent_estimate = outgoing.estimate
         if outgoing.repeat == 0:
             self.latency.add(now_ns - outgoing.capture_ns)
         if self._vehicle is not None:
@@ -344,6 +348,16 @@ class LinkProtocol:
         if advice is not None and (self._advice is None or advice.differs(self._advice)):
             self._advice = advice
             logger.info("measured latency asks for %s", advice)
+
+    def _about_us(self, now_ns: int) -> list[MavlinkMessage]:
+        out: list[MavlinkMessage] = []
+        # Each reading once: of a worker that hangs, the last one would look alive.
+        if self.computer is not None and self._computer_timer is not None and self._computer_timer.due(now_ns):
+            out.append(encode_onboard_computer_status(self.computer, now_ns))
+            self.computer = None
+        if self.sent_estimate is not None and self._quality_timer is not None and self._quality_timer.due(now_ns):
+            out += encode_quality(self.sent_estimate, now_ns)
+        return out
 
     @property
     def sinks(self) -> tuple[Sink, ...]:

@@ -2,7 +2,22 @@
 
 from __future__ import annotations
 
+from ortholoc_edge.adapters.mavlink.estimates import Autopilot
+from ortholoc_edge.adapters.mavlink.options import LinkOptions
+
 _S = 1_000_000_000
+
+
+def wanted_rates_hz(options: LinkOptions, autopilot: Autopilot) -> dict[str, float]:
+    """Which messages an autopilot is asked to send, by name."""
+    return {
+        "ATTITUDE_QUATERNION": options.attitude_rate_hz,
+        "LOCAL_POSITION_NED": options.position_rate_hz,
+        "GPS_RAW_INT": 2.0,
+        "SYSTEM_TIME": 1.0,
+        "EXTENDED_SYS_STATE": 1.0,
+        "EKF_STATUS_REPORT" if autopilot is Autopilot.ARDUPILOT else "ESTIMATOR_STATUS": 2.0,
+    }
 
 
 class Stream:
