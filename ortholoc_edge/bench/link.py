@@ -410,7 +410,11 @@ def measure(kind: WireKind, seconds: float, load: LocalizerLoad | None, seed: in
     Raises: LinkError if the link does not come up.
     """
     rng = random.Random(seed)
-    with Autopilot(kind) as autopilot, AutopilotLink(LinkOptions(endpoint=autopilot.endpoint, release="raw"), SystemClock()) as link:
+    with (
+        Autopilot(kind) as autopilot,
+        # Raw: else what is measured is the next tick of fast-forward.
+        AutopilotLink(LinkOptions(endpoint=autopilot.endpoint, release="raw"), SystemClock()) as link,
+    ):
         _wait_until(lambda: link.connected() and link.statistics()["synchronised"] is True, "the link is up")
         autopilot.mark()
         steps, begin = (0 if load is None else load.steps), time.monotonic()
