@@ -404,17 +404,18 @@ def spread(times_ns: list[int]) -> Spread:
     )
 
 
+def _link_to(autopilot: Autopilot) -> AutopilotLink:
+    """Each estimate once, as soon as it is there: what is carried on and repeated has no time of its own."""
+    return AutopilotLink(LinkOptions(endpoint=autopilot.endpoint, release="raw"), SystemClock())
+
+
 def measure(kind: WireKind, seconds: float, load: LocalizerLoad | None, seed: int) -> Latencies:
     """Both times over one wire.
 
     Raises: LinkError if the link does not come up.
     """
     rng = random.Random(seed)
-    with (
-        Autopilot(kind) as autopilot,
-        # Raw: else what is measured is the next tick of fast-forward.
-        AutopilotLink(LinkOptions(endpoint=autopilot.endpoint, release="raw"), SystemClock()) as link,
-    ):
+    with Autopilot(kind) as autopilot, _link_to(autopilot) as link:
         _wait_until(lambda: link.connected() and link.statistics()["synchronised"] is True, "the link is up")
         autopilot.mark()
         steps, begin = (0 if load is None else load.steps), time.monotonic()
@@ -535,17 +536,16 @@ def soak(kind: WireKind, seconds: float, progress: Callable[[int], None] = lambd
 
 
 def _round(autopilot: Autopilot) -> float:
-    estimate = VisionEstimate(time.monotonic_ns(), np.zeros(3), np.eye(3), np.eye(6))
-    link = AutopilotLink(LinkOptions(endpoint=autopilot.endpoint, release="raw"), SystemClock())
+    link = _link_to(autopilot)
     with link:
         _wait_until(link.connected, "a new link is up")
-        link.send_estimate(estimate)
+        link.send_estimate(VisionEstimate(time.monotonic_ns(), np.zeros(3), np.eye(3), np.eye(6)))
         _wait_until(lambda: link.statistics().get("sent.ODOMETRY") == 1, "an estimate is sent")
         autopilot.cut()
         _wait_until(lambda: link.statistics()["reconnects"] == 1, "the cut is noticed")
         heard = link.statistics().get("received.HEARTBEAT", 0)
         back_s = _wait_until(lambda: link.statistics().get("received.HEARTBEAT", 0) != heard, "the link is back")
-        link.send_estimate(estimate)
+        link.send_estimate(VisionEstimate(time.monotonic_ns(), np.zeros(3), np.eye(3), np.eye(6)))
         _wait_until(lambda: link.statistics().get("sent.ODOMETRY") == 2, "an estimate is sent again")
     if link.is_alive() or link.failure is not None:
         raise LinkError(f"a link did not end as it should: {link.failure!r}")

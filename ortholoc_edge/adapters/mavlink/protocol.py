@@ -62,7 +62,7 @@ class LinkProtocol:
         self._log = LimitedLog()
         self.system_status = SystemStatus.BOOT
         self.computer: ComputerStatus | None = None
-        self.sent_estimate: VisionEstimate | None = None
+        self._last_sent: Outgoing | None = None
         self.timesync = TimeSync()
         self.counts: Counter[str] = Counter()
         self.telemetry = Telemetry(
@@ -324,7 +324,7 @@ class LinkProtocol:
 
     def sent(self, outgoing: Outgoing, now_ns: int) -> None:
         """An estimate was handed to the line."""
-        self.sent_estimate = outgoing.estimate
+        self._last_sent = outgoing
         if outgoing.repeat == 0:
             self.latency.add(now_ns - outgoing.capture_ns)
         if self._vehicle is not None:
@@ -355,8 +355,8 @@ class LinkProtocol:
         if self.computer is not None and self._computer_timer is not None and self._computer_timer.due(now_ns):
             out.append(encode_onboard_computer_status(self.computer, now_ns))
             self.computer = None
-        if self.sent_estimate is not None and self._quality_timer is not None and self._quality_timer.due(now_ns):
-            out += encode_quality(self.sent_estimate, now_ns)
+        if self._last_sent is not None and self._quality_timer is not None and self._quality_timer.due(now_ns):
+            out += encode_quality(self._last_sent.estimate, self._last_sent.capture_ns, now_ns)
         return out
 
     @property

@@ -45,13 +45,13 @@ def encode_onboard_computer_status(status: ComputerStatus, now_ns: int) -> Mavli
     )
 
 
-def encode_quality(estimate: VisionEstimate, now_ns: int) -> list[MavlinkMessage]:
+def encode_quality(estimate: VisionEstimate, capture_ns: int, now_ns: int) -> list[MavlinkMessage]:
     """NAMED_VALUE_FLOAT, three of them, for plots beside a flight log: quality 0..1, horizontal 1-sigma in m and age
-    in s of the last estimate that was sent."""
+    in s (since the frame was taken) of the last estimate that was sent."""
     values = {
         "VisQuality": estimate.quality,
         "VisSigma": horizontal_sigma_m(estimate),
-        "VisAge": (now_ns - estimate.stamp_ns) / 1e9,
+        "VisAge": (now_ns - capture_ns) / 1e9,
     }
     return [
         dialect.MAVLink_named_value_float_message(
