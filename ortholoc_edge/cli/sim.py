@@ -46,9 +46,15 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--viso-delay-ms",
         type=positive,
+        default=10.0,
         metavar="MS",
-        help="have the autopilot take the time of a fix as ArduPilot does, by the least delay seen lately less this "
-        "(its VISO_DELAY_MS, at most 250), instead of by time synchronisation",
+        help="VISO_DELAY_MS of the autopilot, which has the time of a fix as ArduPilot has it: by the least delay seen "
+        "lately, less this; at most 250 (default: %(default)s, the stock value)",
+    )
+    parser.add_argument(
+        "--timesync-stamps",
+        action="store_true",
+        help="have the autopilot believe a fix's stamp instead, as PX4 does; --viso-delay-ms then counts for nothing",
     )
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     matcher_options.add(parser)
@@ -73,9 +79,9 @@ def run(args: argparse.Namespace) -> int:
         matcher=matcher_options.settings(args),
         release=args.release,
         autopilot=AutopilotOptions(
-            filter=FilterOptions()
-            if args.viso_delay_ms is None
-            else FilterOptions(stamps="jitter", viso_delay_ms=args.viso_delay_ms)
+            filter=FilterOptions(
+                stamps="timesync" if args.timesync_stamps else "jitter", viso_delay_ms=args.viso_delay_ms
+            )
         ),
     )
     done = threading.Event()
