@@ -107,7 +107,7 @@ def enough_inliers(estimate: PoseEstimate, options: GateOptions) -> Refusal | No
 
 
 def with_contrast(contrast: float, support: float, options: GateOptions) -> Refusal | None:
-    """At a wrong pose all patches together fit no better than beside it, even where some agree by chance."""
+    """At a wrong pose all cells together fit no better than beside it, even where some agree by chance."""
     limit = options.min_contrast if support < options.sure_support else options.min_sure_contrast
     if not contrast >= limit:
         return Refusal(Reason.LOW_CONTRAST, "fit of the view over that beside it", contrast, limit)

@@ -50,7 +50,7 @@ class Tuning:
     ``attitude``: the prior's attitude takes part in the pose that goes out.
     ``match_covariance``: a patch counts by how sharp its peak is, and not as all others.
     ``sigma_px``: standard deviation of a patch's place, px of the level, before that of its peak.
-    ``polish``: the last level's pose is where all patches together fit best.
+    ``polish``: the last level's pose is where all cells together fit best.
     """
 
     levels: tuple[Level, ...] = (Level(128, 6, 8, 6), Level(256, 3, 8, 6, 2), Level(512, 2, 16, 3))
@@ -259,7 +259,7 @@ class Track:
         estimate: at the frame's full size.
         query_px: (M, 2) px of the frame without distortion; points_local: (M, 3).
         support: part of the patches in view that agree with the pose.
-        contrast: how much better all patches in view fit there than beside it: `structural.Correlation.contrast`.
+        contrast: how much better all cells in view fit there than beside it: `structural.Correlation.contrast`.
         plausible: whether other ways need not be tried around the same prior.
         convincing: whether they need not be tried anywhere.
         second: the second level's outcome.
