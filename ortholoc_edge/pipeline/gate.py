@@ -34,11 +34,11 @@ class GateOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     min_inliers: Annotated[int, Meta(ge=6)] = 30
     min_inlier_ratio: Annotated[float, Meta(ge=0, le=1)] = 0.20
     # Of structural matching, in place of the two above: how much better the view fits at the pose than beside it, in
-    # sigmas, and the part of the patches in view that agree. Of 542 right poses, two thirds of them of another season,
-    # 99 % have 5.9 and 0.047 or more; of the wrong ones of 10,000 hostile frames the only one above 6.0, two parallel
-    # roads upside down, had 6.2 and 0.033 (docs/studies/structural.md, "Contrast").
-    min_contrast: Annotated[float, Meta(ge=0)] = 6.5
-    min_support: Annotated[float, Meta(ge=0, le=1)] = 0.04
+    # sigmas, and the part of the patches in view that agree. Of 10,000 hostile frames the false poses without a rival had
+    # a contrast of 8.3 at most and a support of 0.076; of 1031 right ones, most of them of another season, these limits
+    # refuse 17 (docs/studies/structural.md, "Contrast").
+    min_contrast: Annotated[float, Meta(ge=0)] = 10.5
+    min_support: Annotated[float, Meta(ge=0, le=1)] = 0.03
     # Contrast that is enough with ``sure_support``: oblique views have less of it, for their far parts show little.
     min_sure_contrast: Annotated[float, Meta(ge=0)] = 5.0
     # Inliers of the best pose elsewhere within the prior, as a part of this one's.

@@ -133,7 +133,7 @@ _CLUSTERS_ACROSS = 5
 # On the variance: errors that vary slowly are absorbed by the pose. With 2.5, as in `pose.pnp`, the real flights'
 # normalised error averages 0.65 of what it should. The worse the patches fit, the more of them are another season's
 # shadows and crowns, which err alike.
-_ABSORBED_ERROR_FACTOR = 1.9
+_ABSORBED_ERROR_FACTOR = 1.7
 _DOUBTFUL_SCORE, _DOUBT_POWER = 0.38, 8
 # Also where a prior claims to be exact there is something to divide by: 1 mm, 1e-5 rad.
 _EXACT = np.diag([1e-6] * 3 + [1e-10] * 3)
