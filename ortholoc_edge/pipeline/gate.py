@@ -36,7 +36,7 @@ class GateOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     # Of structural matching, in place of the two above: how much better the view fits at the pose than beside it, in
     # sigmas, and the part of the patches in view that agree. Of 10,000 hostile frames the false poses without a rival had
     # a contrast of 8.3 at most and a support of 0.076; of 1031 right ones, most of them of another season, these limits
-    # refuse 17 (docs/studies/structural.md, "Contrast").
+    # refuse 19 (docs/studies/structural.md, "Contrast").
     min_contrast: Annotated[float, Meta(ge=0)] = 10.5
     min_support: Annotated[float, Meta(ge=0, le=1)] = 0.03
     # Contrast that is enough with ``sure_support``: oblique views have less of it, for their far parts show little.
