@@ -607,7 +607,7 @@ def test_stopped_and_slow_streams_are_asked_for_again():
     assert 2 <= script.commands(511).count(31) <= 12
 
 
-def test_silent_autopilot_is_left_alone_and_replaced():
+def test_silent_autopilot_is_left_alone_and_none_takes_its_place():
     script = Script()
     script.run(2.0)
     script.said.clear()
@@ -616,9 +616,15 @@ def test_silent_autopilot_is_left_alone_and_replaced():
         script.said += script.protocol.poll(script.now)
     assert not script.protocol.connected(script.now)
     assert {m.get_type() for m in script.said[300:]} <= {"HEARTBEAT"}
+    # Its neighbour's attitude would be worse than none; a swap on the bench takes a restart of ours.
     script.now += 2 * S
     script.hear(heartbeat(12), system=4)
-    assert script.protocol.vehicle.autopilot is Autopilot.PX4 and script.protocol.connected(script.now)
+    assert script.protocol.vehicle.system_id == 7 and not script.protocol.connected(script.now)
+    assert script.protocol.trouble(script.now) == (
+        "autopilot (system 7) silent since 11 s; system 4 is heard, but not served: restart us to take it"
+    )
+    script.hear(heartbeat())
+    assert script.protocol.connected(script.now)
 
 
 def test_origin_is_offered_only_where_there_is_none():
