@@ -594,6 +594,38 @@ def test_gnss_is_carried_from_its_own_time(clock, answered):
     assert script.protocol.state_at(script.now).gnss is None
 
 
+def test_gnss_is_of_the_frame_not_the_latest():
+    """A frame that waited 3 s has the fix of then."""
+    script = Script()
+    heard = 0
+
+    def fly():
+        nonlocal heard
+        script.local([0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+        if script.now - heard >= 500 * MS:
+            heard = script.now
+            script.hear(gps(lat=LAT + (script.now - 1000 * S) // (100 * MS), time_ms=script.boot_ms()))
+
+    script.run(8.0, move=fly)
+    for age_s in (0.3, 1.4, 3.0, 5.0):
+        stamp = script.now - round(age_s * S)
+        expected = (stamp - 1000 * S) / S * 10 * 1e-7 * M_PER_DEG_NORTH
+        assert north_of(script, stamp) == pytest.approx(expected, abs=0.1)
+
+
+def test_an_origin_that_wavers_is_the_same():
+    script = Script()
+    script.run(2.0, move=lambda: script.local([0.0, 0.0, 0.0]))
+    script.hear(dialect.MAVLink_gps_global_origin_message(507000000, 72000000, 60000))
+    before = script.protocol.state_at(script.now)
+    for lat, lon, alt in ((1, 0, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1), (-1, 1, 1)):
+        script.hear(dialect.MAVLink_gps_global_origin_message(507000000 + lat, 72000000 + lon, 60000 + alt))
+        state = script.protocol.state_at(script.now)
+        assert state.origin == before.origin and script.protocol.telemetry.local_epoch == before.local_epoch
+    script.hear(dialect.MAVLink_gps_global_origin_message(507000000, 72000000, 60200))
+    assert script.protocol.telemetry.local_epoch == before.local_epoch + 1
+
+
 def test_stopped_and_slow_streams_are_asked_for_again():
     script = Script(attitude_rate_hz=50.0)
     script.run(3.0, move=lambda: script.attitude(0.0))
