@@ -23,7 +23,6 @@ from adapters.link_scenes import Flight
 from adapters.test_mavlink import Script, check_attitude, estimate, good_state
 from adapters.test_survival import BadLine
 from replay import rendered
-from scenes_pipeline import fix
 
 from ortholoc_edge.adapters.mavlink import AutopilotLink, LinkOptions
 from ortholoc_edge.adapters.mavlink import link as link_module
@@ -405,8 +404,7 @@ def spoof_ramp() -> None:
         prior = tracker.predict(state)
         assert not isinstance(prior, Rejected), "the chain of fixes goes on"
         drawn_m = max(drawn_m, float(np.linalg.norm((prior.map_from_camera.translation - centre)[:2])))
-        body = Rigid3(rotation.from_euler(0.0, 0.0, 0.0), centre)
-        tracker.update(rendered_fix(body, script.now), state)
+        tracker.update(fix_at(centre, script.now), state)
         consistency = tracker.witness.report.state
         command = switch.decide(consistency, True, Autopilot.ARDUPILOT, 0, script.now)
         if command is not None:
@@ -420,8 +418,20 @@ def spoof_ramp() -> None:
     assert tracker.reset_counter == 1, "the first fix, and nothing since"
 
 
-def rendered_fix(pose: Rigid3, stamp_ns: int) -> Fix:
-    return fix(pose.translation, stamp_ns=stamp_ns, rotation_matrix=np.diag([1.0, -1.0, -1.0]))
+def fix_at(position: np.ndarray, stamp_ns: int) -> Fix:
+    return Fix(
+        stamp_ns=stamp_ns,
+        map_from_camera=Rigid3(np.diag([1.0, -1.0, -1.0]), position),
+        camera=rendered.CAMERA,
+        covariance=np.diag(np.square([0.5] * 3 + [0.005] * 3)),
+        quality=0.8,
+        matches=200,
+        inliers=160,
+        rms_px=1.2,
+        adhop_accepted=None,
+        query_px=np.zeros((160, 2)),
+        points_map=np.zeros((160, 3)),
+    )
 
 
 # Scenario: (script, behaviour, what stays unaffected); the words are those of docs/link.md.
