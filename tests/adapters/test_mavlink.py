@@ -892,6 +892,7 @@ def test_flight_over_a_real_wire(pair):
         assert min(wait_for(lambda: len(autopilot.timesync_answers) > 9 and autopilot.timesync_answers)) < 10 * MS
         statistics = link.statistics()
         assert statistics["sent.ODOMETRY"] == 1 and statistics["reconnects"] == 0
+        assert link.fixes_sent == 1
         assert statistics["bad_frames"] == 0 and statistics["synchronised"]
 
 
@@ -995,6 +996,7 @@ def test_nan_attitude_reboot_and_jump_in_flight():
         wait_for(lambda: not link.connected())
         link.send_estimate(estimate())
         wait_for(lambda: link.statistics()["estimates_dropped"] >= 1)
+        assert link.fixes_sent == 0, "only what went out counts"
         autopilot.mute = False
         wait_for(lambda: good_state(link))
 
