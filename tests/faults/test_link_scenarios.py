@@ -471,7 +471,8 @@ SCENARIOS: dict[str, tuple[Callable[..., None], tuple[Any, ...], str, str]] = {
         autopilots_clock_steps, (-900,), "the same", "the same",
     ),
     "our wall clock steps": (
-        our_wall_clock_steps, (), "nothing: stamps are of the monotonic clock (`GPS_INPUT` alone needs the date)", "all",
+        our_wall_clock_steps, (), "nothing: stamps are of the monotonic clock (`GPS_INPUT` alone needs the date)",
+        "all",
     ),
     "round trip of 50 ms": (
         round_trip_of_50_ms, (), "the stated uncertainty of the clocks is half of it, and holds",
