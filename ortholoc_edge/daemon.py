@@ -33,7 +33,7 @@ from ortholoc_edge.adapters.mavlink import (
 from ortholoc_edge.adapters.mavlink.audit import Level
 from ortholoc_edge.adapters.mavlink.checkup import Checkup
 from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate
-from ortholoc_edge.adapters.mavlink.geodesy import EarthModel, GeodeticOrigin, Place, ned_from_geodetic
+from ortholoc_edge.adapters.mavlink.geodesy import EarthModel, GeodeticOrigin, Place, is_same_origin, ned_from_geodetic
 from ortholoc_edge.adapters.mavlink.herald import Herald
 from ortholoc_edge.adapters.mavlink.sinks import earth_model
 from ortholoc_edge.adapters.mavlink.sources import SourceSwitch
@@ -181,10 +181,12 @@ class Daemon:
         self._counts: Counter[str] = Counter()
         self._origin_missing = False
         self._checkup: Checkup | None = Checkup(
-            self._link, config.link, lever_arm_m=config.mount.lever_arm_m, latency_ms=None
+            self._link, config.link, lever_arm_m=config.mount.lever_arm_m, ages=self._link.ages
         )
+        self._findings_told: set[str] = set()
         self._damage_reported = 0
         self._origin: GeodeticOrigin | None = None
+        self._restarts = 0
         self._recovering = False
         self._last_status_ns = 0
         self._herald = Herald()
@@ -200,6 +202,7 @@ class Daemon:
         witness = self._navigator.tracker.witness.report
         return {
             **self._counts,
+            "sent": self._link.fixes_sent,
             "frames_replaced": self._slot.replaced,
             "rung": self._navigator.ladder.rung,
             "gnss_consistency": witness.state.value,
@@ -344,8 +347,9 @@ class Daemon:
 
     def _vehicle_state(self, stamp_ns: int, known: AutopilotState | None) -> VehicleState:
         roll, pitch, yaw = (math.radians(sigma) for sigma in self._config.attitude.sigma_deg)
+        trouble = self._link.trouble() if known is None or known.ned_from_body is None else None
         if known is None:
-            return VehicleState(stamp_ns, None, (roll, pitch, yaw))
+            return VehicleState(stamp_ns, None, (roll, pitch, yaw), no_attitude_because=trouble or "")
         position = None if known.gnss is None else self._map_position(known.gnss)
         return VehicleState(
             stamp_ns,
@@ -356,6 +360,7 @@ class Daemon:
             position,
             (0.0, 0.0) if known.gnss is None else (known.gnss.sigma_horizontal_m, known.gnss.sigma_vertical_m),
             self._gimbal_mount(known),
+            trouble or "",
         )
 
     def _gimbal_mount(self, known: AutopilotState) -> CameraMount | None:
@@ -395,12 +400,18 @@ class Daemon:
             self._offer_origin(map_from_body.translation)
             if all(local):
                 return
-        if any(local) and self._origin is not None and now.origin not in (None, self._origin):
-            # What was sent before meant other places; without notice the filter would take this for a jump.
-            logger.warning("the autopilot's origin moved")
+        moved = any(local) and not (
+            self._origin is None or now.origin is None or is_same_origin(now.origin, self._origin)
+        )
+        restarts = self._link.restarts
+        if moved or restarts != self._restarts:
+            # What was sent before meant other places, or is forgotten; without notice the filter would take this for
+            # a jump.
+            why = "moved its origin" if moved else "restarted"
+            logger.warning("the autopilot %s; its filter is told to start anew", why)
             self._navigator.tracker.announce_jump()
+        self._restarts = restarts
         self._origin = now.origin or self._origin
-        self._counts["sent"] += 1
         estimate = vision_estimate(
             fix,
             map_from_body,
@@ -467,11 +478,17 @@ class Daemon:
             self._bus.publish_autopilot(autopilot_record(now_ns, self._link, witness, self._sources.on_vision))
 
     def _report_audit(self, now_ns: int) -> None:
-        """Say once what is wrong with the autopilot's settings."""
+        """Say once what is wrong with the autopilot's settings; of its delays as soon as our latency is known."""
         if self._checkup is None or not self._checkup.step(now_ns):
             return
-        findings = [finding for finding in self._checkup.findings() if finding.level is not Level.NOTE]
-        self._checkup = None
+        findings = [
+            finding
+            for finding in self._checkup.findings()
+            if finding.level is not Level.NOTE and finding.subject not in self._findings_told
+        ]
+        if self._link.ages() is not None:
+            self._checkup = None
+        self._findings_told.update(finding.subject for finding in findings)
         for finding in findings:
             logger.warning(
                 "autopilot: %s is %s, wanted %s: %s; %s",
@@ -483,7 +500,7 @@ class Daemon:
             self._link.send_status_text(Severity.WARNING, text)
         if len(errors) > _MOST_AUDIT_TEXTS:
             self._link.send_status_text(Severity.WARNING, f"OrthoLoC: {len(errors)} settings wrong, see doctor")
-        self._counts["audit_findings"] = len(findings)
+        self._counts["audit_findings"] = len(self._findings_told)
 
     def _report_damage(self) -> None:
         """Say that the map has holes: once the autopilot is there, and again if more are found in flight."""

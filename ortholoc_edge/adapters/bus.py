@@ -6,15 +6,17 @@ from __future__ import annotations
 import json
 import logging
 import re
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
-import zenoh
 from msgspec import Meta, Struct
 
 from ortholoc_edge.errors import ConfigError, LinkError
 from ortholoc_edge.pipeline.outcome import Fix, Outcome
 from ortholoc_edge.pipeline.record import outcome_record
+
+if TYPE_CHECKING:
+    import zenoh  # 4 MB, so where the bus is off it is not imported
 
 logger = logging.getLogger(__name__)
 
@@ -77,7 +79,10 @@ class Bus:
     """
 
     def __init__(self, options: BusOptions) -> None:
+        import zenoh
+
         self.dropped = 0
+        self._error = zenoh.ZError
         self._prefix = f"ortholoc/{options.vehicle}"
         config = _session_config(options)
         try:
@@ -115,7 +120,7 @@ class Bus:
     def _put(self, name: str, record: object) -> None:
         try:
             self._publishers[name].put(msgspec.json.encode(record))
-        except zenoh.ZError:
+        except self._error:
             self.dropped += 1
             logger.warning("zenoh: %s not published", name, exc_info=True)
 
@@ -125,6 +130,8 @@ class Bus:
 
 def _session_config(options: BusOptions) -> zenoh.Config:
     """Raises: ConfigError naming the endpoint that is malformed."""
+    import zenoh
+
     for endpoint in options.listen:
         if not _well_formed(endpoint):
             raise ConfigError(

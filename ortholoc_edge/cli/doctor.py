@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -17,7 +18,9 @@ import msgspec
 from ortholoc_edge.adapters.mavlink import AutopilotLink, LinkOptions
 from ortholoc_edge.adapters.mavlink.audit import Finding, Level, Situation
 from ortholoc_edge.adapters.mavlink.checkup import Checkup
+from ortholoc_edge.adapters.mavlink.latency import Ages
 from ortholoc_edge.adapters.mavlink.parameters import Answer, Written
+from ortholoc_edge.adapters.mavlink.signing import beside
 from ortholoc_edge.cli.arguments import non_negative, positive
 from ortholoc_edge.clock import SystemClock
 from ortholoc_edge.config import read_config
@@ -77,13 +80,13 @@ def run(args: argparse.Namespace) -> int:
         changes["endpoint"] = args.link
     if args.system_id is not None:
         changes["system_id"] = args.system_id
-    options = msgspec.structs.replace(options, **changes)
+    options = beside(msgspec.structs.replace(options, **changes), "doctor", os.environ)
     clock = SystemClock()
     link = AutopilotLink(options, clock)
     checkup = Checkup(
         link, options,
         lever_arm_m=None if config is None else config.mount.lever_arm_m,
-        latency_ms=args.latency_ms,
+        ages=lambda: _ages(args.latency_ms, None if config is None else link),
     )  # fmt: skip
     link.start(open_now=True)
     try:
@@ -108,6 +111,13 @@ def run(args: argparse.Namespace) -> int:
     finally:
         link.stop()
     return 1 if any(finding.level is not Level.NOTE for finding in findings) else 0
+
+
+def _ages(latency_ms: float | None, configured: AutopilotLink | None) -> Ages | None:
+    """As given; else what the daemon's configuration says of it, which is nothing for "raw"."""
+    if latency_ms is not None:
+        return Ages(latency_ms, latency_ms, latency_ms)
+    return None if configured is None else configured.ages()
 
 
 def _listen(link: AutopilotLink, checkup: Checkup, clock: SystemClock, timeout_s: float) -> None:

@@ -51,6 +51,7 @@ class VehicleState:
         position_map_m: (3,) easting, northing, height from an absolute source that is trusted now (GNSS before
             it was lost); None otherwise.
         position_sigma_m: 1-sigma of that position, horizontal (per axis) and vertical.
+        no_attitude_because: in words, where that is known; empty otherwise.
         mount: of a camera in a gimbal, as it was at the stamp; None of a fixed one, which the tracker knows, and
             where nothing is known of the gimbal.
     """
@@ -63,3 +64,4 @@ class VehicleState:
     position_map_m: FloatArray | None = None
     position_sigma_m: tuple[float, float] = (0.0, 0.0)
     mount: CameraMount | None = None
+    no_attitude_because: str = ""

@@ -97,8 +97,9 @@ class Tracker:
         self._last_prior = None
         attitude = state.ned_from_body
         if attitude is None or not np.isfinite(attitude).all() or not np.isfinite(state.attitude_sigma_rad).all():
+            why = f": {state.no_attitude_because}" if state.no_attitude_because else ""
             return Rejected(
-                state.stamp_ns, Reason.BAD_ATTITUDE, "no finite attitude from the autopilot at the exposure"
+                state.stamp_ns, Reason.BAD_ATTITUDE, f"no finite attitude from the autopilot at the exposure{why}"
             )
         self.witness.tick(state.stamp_ns)
         self._take_absolute(state)

@@ -10,6 +10,7 @@ from ortholoc_edge.adapters.mavlink.audit import Finding, Level, Situation, audi
 from ortholoc_edge.adapters.mavlink.census import LinkHealth, Peer
 from ortholoc_edge.adapters.mavlink.estimates import Autopilot
 from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin
+from ortholoc_edge.adapters.mavlink.latency import Ages
 from ortholoc_edge.adapters.mavlink.parameters import Answer, Reading
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity
 
@@ -38,6 +39,10 @@ def health(autopilot=ARDUPILOT, version=(4, 5, 7), **changes) -> LinkHealth:
         set_origin=False,
     )
     return replace(good, **changes)
+
+
+def aged(latency_ms: float | None) -> Ages | None:
+    return None if latency_ms is None else Ages(latency_ms, latency_ms, latency_ms)
 
 
 def readings(autopilot, sinks, parameters) -> dict[str, Reading]:
@@ -74,11 +79,11 @@ def serious(findings: list[Finding]) -> list[tuple[str, str]]:
 
 def test_what_works_has_nothing_wrong():
     ready = {**ARDUPILOT_READY, "VISO_DELAY_MS": 150}
-    assert audit(situation(ready, latency_ms=150.0)) == []
-    assert serious(audit(px4(PX4_READY, latency_ms=150.0))) == []
+    assert audit(situation(ready, ages=aged(150.0))) == []
+    assert serious(audit(px4(PX4_READY, ages=aged(150.0)))) == []
     slots = {**PX4_WITH_SLOTS, "EKF2_HGT_REF": 0, "MAV_0_MODE": 2}
     slots |= {"EKF2_AGP1_ID": 1, "EKF2_AGP1_CTRL": 1, "EKF2_AGP1_DELAY": 150.0}
-    assert audit(px4(slots, (1, 18, 0), sinks=("global_position_sensor",), latency_ms=150.0)) == []
+    assert audit(px4(slots, (1, 18, 0), sinks=("global_position_sensor",), ages=aged(150.0))) == []
 
 
 def test_stock_firmware_and_the_commands_that_mend_it():
@@ -179,7 +184,7 @@ def test_gates_that_refuse_nothing_are_noted_not_changed():
 
 def test_delay_follows_the_measured_latency():
     def at(latency_ms, delay):
-        return audit(situation({**ARDUPILOT_READY, "VISO_DELAY_MS": delay}, latency_ms=latency_ms))
+        return audit(situation({**ARDUPILOT_READY, "VISO_DELAY_MS": delay}, ages=aged(latency_ms)))
 
     assert at(165.0, 150) == []
     (wrong,) = at(200.0, 10)
@@ -191,16 +196,16 @@ def test_delay_follows_the_measured_latency():
 
 
 def test_px4_looks_back_as_far_as_the_latency():
-    findings = audit(px4(PX4_READY, latency_ms=260.0))
+    findings = audit(px4(PX4_READY, ages=aged(260.0)))
     assert [f.change for f in findings if f.change] == [("EKF2_DELAY_MAX", 310)]
     slots = {**PX4_WITH_SLOTS, "EKF2_HGT_REF": 0, "EKF2_AGP0_ID": 1, "EKF2_AGP0_CTRL": 1}
-    findings = audit(px4(slots, (1, 18, 0), sinks=("global_position_sensor",), latency_ms=400.0))
+    findings = audit(px4(slots, (1, 18, 0), sinks=("global_position_sensor",), ages=aged(400.0)))
     assert {f.change for f in findings if f.change} == {("EKF2_DELAY_MAX", 450), ("EKF2_AGP0_DELAY", 400)}
 
 
 def test_px4s_delay_is_the_latency_only_where_its_timesync_cannot_converge():
     slow = health(PX4, (1, 14, 3), round_trip_ms=15.0)
-    findings = audit(px4(PX4_READY, health=slow, latency_ms=150.0))
+    findings = audit(px4(PX4_READY, health=slow, ages=aged(150.0)))
     assert [f.change for f in findings if f.change] == [("EKF2_EV_DELAY", 150)]
 
 

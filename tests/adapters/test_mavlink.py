@@ -594,6 +594,38 @@ def test_gnss_is_carried_from_its_own_time(clock, answered):
     assert script.protocol.state_at(script.now).gnss is None
 
 
+def test_gnss_is_of_the_frame_not_the_latest():
+    """A frame that waited 3 s has the fix of then."""
+    script = Script()
+    heard = 0
+
+    def fly():
+        nonlocal heard
+        script.local([0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+        if script.now - heard >= 500 * MS:
+            heard = script.now
+            script.hear(gps(lat=LAT + (script.now - 1000 * S) // (100 * MS), time_ms=script.boot_ms()))
+
+    script.run(8.0, move=fly)
+    for age_s in (0.3, 1.4, 3.0, 5.0):
+        stamp = script.now - round(age_s * S)
+        expected = (stamp - 1000 * S) / S * 10 * 1e-7 * M_PER_DEG_NORTH
+        assert north_of(script, stamp) == pytest.approx(expected, abs=0.1)
+
+
+def test_an_origin_that_wavers_is_the_same():
+    script = Script()
+    script.run(2.0, move=lambda: script.local([0.0, 0.0, 0.0]))
+    script.hear(dialect.MAVLink_gps_global_origin_message(507000000, 72000000, 60000))
+    before = script.protocol.state_at(script.now)
+    for lat, lon, alt in ((1, 0, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1), (-1, 1, 1)):
+        script.hear(dialect.MAVLink_gps_global_origin_message(507000000 + lat, 72000000 + lon, 60000 + alt))
+        state = script.protocol.state_at(script.now)
+        assert state.origin == before.origin and script.protocol.telemetry.local_epoch == before.local_epoch
+    script.hear(dialect.MAVLink_gps_global_origin_message(507000000, 72000000, 60200))
+    assert script.protocol.telemetry.local_epoch == before.local_epoch + 1
+
+
 def test_stopped_and_slow_streams_are_asked_for_again():
     script = Script(attitude_rate_hz=50.0)
     script.run(3.0, move=lambda: script.attitude(0.0))
@@ -607,7 +639,7 @@ def test_stopped_and_slow_streams_are_asked_for_again():
     assert 2 <= script.commands(511).count(31) <= 12
 
 
-def test_silent_autopilot_is_left_alone_and_replaced():
+def test_silent_autopilot_is_left_alone_and_none_takes_its_place():
     script = Script()
     script.run(2.0)
     script.said.clear()
@@ -616,9 +648,15 @@ def test_silent_autopilot_is_left_alone_and_replaced():
         script.said += script.protocol.poll(script.now)
     assert not script.protocol.connected(script.now)
     assert {m.get_type() for m in script.said[300:]} <= {"HEARTBEAT"}
+    # Its neighbour's attitude would be worse than none; a swap on the bench takes a restart of ours.
     script.now += 2 * S
     script.hear(heartbeat(12), system=4)
-    assert script.protocol.vehicle.autopilot is Autopilot.PX4 and script.protocol.connected(script.now)
+    assert script.protocol.vehicle.system_id == 7 and not script.protocol.connected(script.now)
+    assert script.protocol.trouble(script.now) == (
+        "autopilot (system 7) silent since 11 s; system 4 is heard, but not served: restart us to take it"
+    )
+    script.hear(heartbeat())
+    assert script.protocol.connected(script.now)
 
 
 def test_origin_is_offered_only_where_there_is_none():
@@ -854,6 +892,7 @@ def test_flight_over_a_real_wire(pair):
         assert min(wait_for(lambda: len(autopilot.timesync_answers) > 9 and autopilot.timesync_answers)) < 10 * MS
         statistics = link.statistics()
         assert statistics["sent.ODOMETRY"] == 1 and statistics["reconnects"] == 0
+        assert link.fixes_sent == 1
         assert statistics["bad_frames"] == 0 and statistics["synchronised"]
 
 
@@ -957,6 +996,7 @@ def test_nan_attitude_reboot_and_jump_in_flight():
         wait_for(lambda: not link.connected())
         link.send_estimate(estimate())
         wait_for(lambda: link.statistics()["estimates_dropped"] >= 1)
+        assert link.fixes_sent == 0, "only what went out counts"
         autopilot.mute = False
         wait_for(lambda: good_state(link))
 

@@ -281,3 +281,23 @@ def test_a_place_is_carried_on_as_a_local_position_is():
         assert (estimate.place.latitude_deg - 50.0) * 111_229.0 == pytest.approx(5.0, abs=0.01)
         assert (estimate.place.longitude_deg, estimate.place.height_ellipsoid_m) == pytest.approx((7.0, 147.0))
         assert (estimate.position_ned_m is None) == (fix.position_ned_m is None)
+
+
+@pytest.mark.parametrize("most_m", [10.0, 100.0])
+@pytest.mark.parametrize("sigma_m", [0.5, 3.5, 5.0, 6.5, 9.0])
+def test_no_repeat_is_beyond_what_the_filter_believes(sigma_m, most_m):
+    """ArduPilot before 4.7 takes 30 m for 10; the sink refuses that, so that a fix of 5 m would never arrive."""
+    flight = Flight()
+    flight.reported_velocity = flight.velocity = np.zeros(3)
+    release = make()
+    release.believed = (most_m, 1.5)
+    out = fly(release, flight, 8 * S, regular(flight, sigma_m=sigma_m, count=12))
+    for capture, group in itertools.groupby(out, key=lambda entry: entry[1].capture_ns):
+        sigmas = [float(np.sqrt(o.estimate.covariance[0, 0])) for _, o in group]
+        assert max(sigmas) <= most_m
+        assert sum(sigma**-2 for sigma in sigmas) <= sigma_m**-2 * (1.0 + 1e-9), "no more than the fix tells"
+        assert len(sigmas) == 1 if sigma_m == 9.0 and most_m == 10.0 else len(sigmas) >= 2, capture
+    if most_m == 10.0 and sigma_m > 3.5:
+        assert release.counts["repeats_fewer"] >= 10
+    else:
+        assert release.counts["repeats_fewer"] <= 1, "of the last fix only, which nothing follows"

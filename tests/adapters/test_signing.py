@@ -7,6 +7,7 @@ import socket
 import time
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -24,6 +25,7 @@ from ortholoc_edge.adapters.mavlink.signing import (
     StampStore,
     Verdict,
     Verifier,
+    beside,
     make_signing,
     read_key,
     stamp_of,
@@ -357,3 +359,16 @@ def test_a_peer_whose_clock_is_behind_is_spoken_to(tmp_path):
             assert link.statistics()["signature_too_old"] >= 1
     finally:
         connection.close()
+
+
+def test_another_program_beside_has_stamps_of_its_own(tmp_path):
+    """`doctor` while the daemon flies: neither file nor link id is shared."""
+    options = LinkOptions(endpoint="udp:x:1", signing_key="/key", signing_link_id=3)
+    environ = {"STATE_DIRECTORY": str(tmp_path)}
+    other = beside(options, "doctor", environ)
+    assert other.signing_link_id != options.signing_link_id
+    assert other.signing_state == str(tmp_path / "mavlink-signing.doctor")
+    named = beside(msgspec.structs.replace(options, signing_state="/var/x/stamps", signing_link_id=200), "doctor", {})
+    assert (named.signing_state, named.signing_link_id) == ("/var/x/stamps.doctor", 72)
+    unsigned = LinkOptions(endpoint="udp:x:1")
+    assert beside(unsigned, "doctor", {}) is unsigned

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import pytest
 
+from ortholoc_edge.adapters.mavlink.audit import audit
 from ortholoc_edge.adapters.mavlink.estimates import Autopilot
 from ortholoc_edge.adapters.mavlink.herald import Herald
-from ortholoc_edge.adapters.mavlink.latency import LatencyMeter, advise
+from ortholoc_edge.adapters.mavlink.latency import LatencyMeter, advise, ages_of
 from ortholoc_edge.adapters.mavlink.monitor import Fusion, FusionReport
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity
+from ortholoc_edge.adapters.mavlink.parameters import Answer, Reading
 from ortholoc_edge.adapters.mavlink.sources import PendingSwitch, Source, SourceSwitch
 from ortholoc_edge.pipeline.witness import Consistency, WitnessReport
+
+from .test_audit import health, situation
 
 MS, S = 1_000_000, 1_000_000_000
 OK, BAD, SUSPECT, UNKNOWN = Consistency.OK, Consistency.BAD, Consistency.SUSPECT, Consistency.UNKNOWN
@@ -167,3 +172,28 @@ def test_only_a_material_change_is_told():
     near = advise(Autopilot.ARDUPILOT, "raw", meter(*[v + 9 for v in SPREAD]), 250.0, 8 * MS)
     far = advise(Autopilot.ARDUPILOT, "raw", meter(*[v + 60 for v in SPREAD]), 250.0, 8 * MS)
     assert not near.differs(first) and far.differs(first)
+
+
+@pytest.mark.parametrize("round_trip_ms", [4, 20])
+@pytest.mark.parametrize("mode", ["raw", "fixed-latency", "fast-forward"])
+def test_the_audit_wants_what_the_daemon_advises(mode, round_trip_ms):
+    """Set as advised, a PX4 and an ArduPilot have nothing wrong about delays."""
+    ages = ages_of(mode, meter(*SPREAD), 200.0, round_trip_ms * MS)
+    for autopilot, sinks in ((Autopilot.ARDUPILOT, "odometry"), (Autopilot.PX4, "odometry"),
+                             (Autopilot.PX4, "global_position_sensor")):  # fmt: skip
+        advice = advise(autopilot, mode, meter(*SPREAD), 200.0, round_trip_ms * MS)
+        values = {
+            "VISO_DELAY_MS": advice.viso_delay_ms, "EKF2_EV_DELAY": advice.ev_delay_ms, "EKF2_AGP0_ID": 1,
+            "EKF2_AGP0_DELAY": advice.agp_delay_ms, "EKF2_DELAY_MAX": advice.delay_max_ms,
+        }  # fmt: skip
+
+        def about_delays(values, autopilot=autopilot, sinks=sinks):
+            looked_at = replace(
+                situation({}, autopilot, sinks=(sinks,), health=health(autopilot, round_trip_ms=float(round_trip_ms))),
+                readings={name: Reading(Answer.VALUE, value, 6) for name, value in values.items()}, ages=ages,
+            )  # fmt: skip
+            return {finding.subject for finding in audit(looked_at) if "DELAY" in finding.subject}
+
+        assert about_delays(values) == set()
+        wrong = {name: value + 100 if name.endswith(("DELAY", "_MS")) else value for name, value in values.items()}
+        assert about_delays(wrong), "it can find something"

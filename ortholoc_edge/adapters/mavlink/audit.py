@@ -12,6 +12,7 @@ from enum import StrEnum
 
 from ortholoc_edge.adapters.mavlink.census import LinkHealth, Peer
 from ortholoc_edge.adapters.mavlink.estimates import Autopilot
+from ortholoc_edge.adapters.mavlink.latency import Ages
 from ortholoc_edge.adapters.mavlink.parameters import Answer, Number, Reading
 
 Version = tuple[int, int, int]
@@ -76,7 +77,7 @@ class Situation:
         sinks: names of the messages that carry our estimates, as in ``[link] send``.
         sensor_id: ours in GLOBAL_POSITION_SENSOR.
         lever_arm_m: ``[mount] lever_arm_m``, which we take off ourselves; None if it isn't known.
-        latency_ms: measured, from mid-exposure to the bytes on the wire; None if it isn't known.
+        ages: of estimates when they arrive; None if that isn't known.
         baud: of our serial line; None for a network.
         readings: parameters by name.
     """
@@ -88,7 +89,7 @@ class Situation:
     readings: Mapping[str, Reading]
     sensor_id: int = 1
     lever_arm_m: tuple[float, float, float] | None = None
-    latency_ms: float | None = None
+    ages: Ages | None = None
     baud: int | None = None
 
     def value(self, name: str) -> Number | None:
@@ -154,9 +155,9 @@ def _expect(
         yield from _setting(situation, level, name, wanted, why, reboot=reboot)
 
 
-def _delay(situation: Situation, name: str, most_ms: float) -> Iterator[Finding]:
-    """A delay parameter against the measured latency."""
-    found, latency_ms = situation.value(name), situation.latency_ms
+def _delay(situation: Situation, name: str, most_ms: float, latency_ms: float | None) -> Iterator[Finding]:
+    """A delay parameter against the age that it stands for, the one that `latency.advise` names."""
+    found = situation.value(name)
     if found is None:
         return
     if latency_ms is None:
@@ -178,6 +179,10 @@ def _delay(situation: Situation, name: str, most_ms: float) -> Iterator[Finding]
             "a constant delay is known to the filter by this parameter alone: each 10 ms wrong are 0.2 m at 20 m/s",
             reboot=True,
         )  # fmt: skip
+
+
+def _usual_ms(situation: Situation) -> float | None:
+    return None if situation.ages is None else situation.ages.middle_ms
 
 
 def _lever_arm(situation: Situation, names: tuple[str, str, str]) -> Iterator[Finding]:
@@ -415,7 +420,9 @@ def _viso_type(situation: Situation) -> Iterator[Finding]:
 
 
 def _viso_delay(situation: Situation) -> Iterator[Finding]:
-    yield from _delay(situation, "VISO_DELAY_MS", _MOST_VISO_DELAY_MS)
+    # It takes the least of the last hundred for the transport's.
+    low_ms = None if situation.ages is None else situation.ages.low_ms
+    yield from _delay(situation, "VISO_DELAY_MS", _MOST_VISO_DELAY_MS, low_ms)
 
 
 def _viso_lever_arm(situation: Situation) -> Iterator[Finding]:
@@ -572,7 +579,7 @@ def _ev_delay(situation: Situation) -> Iterator[Finding]:
     """PX4 takes our stamps of exposure as soon as its TIMESYNC has converged; if it can't, the time of arrival."""
     found = situation.value("EKF2_EV_DELAY")
     if _slow_for_px4(situation.health):
-        yield from _delay(situation, "EKF2_EV_DELAY", _MOST_EV_DELAY_MS)
+        yield from _delay(situation, "EKF2_EV_DELAY", _MOST_EV_DELAY_MS, _usual_ms(situation))
     elif found is not None and found > _DELAY_SLACK_MS:
         yield from _setting(
             situation, Level.WARNING, "EKF2_EV_DELAY", 0,
@@ -621,11 +628,11 @@ def _px4_horizon(situation: Situation) -> Iterator[Finding]:
     if not LOCAL.isdisjoint(situation.sinks):
         names.append("EKF2_EV_DELAY")
     delays = [value for name in names if (value := situation.value(name)) is not None]
-    needed_ms = max([*delays, situation.latency_ms or 0.0])
+    needed_ms = max([*delays, 0.0 if situation.ages is None else situation.ages.high_ms])
     if most_ms is not None and needed_ms > most_ms:
         yield from _setting(
             situation, Level.ERROR, "EKF2_DELAY_MAX", round(needed_ms + 50.0),
-            f"the filter looks back {most_ms:g} ms only, and fixes are {needed_ms:g} ms old", reboot=True,
+            f"the filter looks back {most_ms:g} ms only, and fixes are {needed_ms:.0f} ms old", reboot=True,
         )  # fmt: skip
 
 
@@ -691,7 +698,7 @@ def _agp(situation: Situation) -> Iterator[Finding]:
             yield from _setting(
                 situation, Level.WARNING, f"EKF2_AGP{n}_NOISE", 1.0, "a better fix counts as no better than this"
             )
-        yield from _delay(situation, f"EKF2_AGP{n}_DELAY", _MOST_AGP_DELAY_MS)
+        yield from _delay(situation, f"EKF2_AGP{n}_DELAY", _MOST_AGP_DELAY_MS, _usual_ms(situation))
         if situation.value(f"EKF2_AGP{n}_MODE") == 1:
             yield Finding(
                 Level.NOTE, f"EKF2_AGP{n}_MODE", "1", "0 or 1, knowingly",

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from ortholoc_edge.adapters.mavlink.audit import Finding, Situation, audit, parameters_wanted
+from ortholoc_edge.adapters.mavlink.latency import Ages
 from ortholoc_edge.adapters.mavlink.link import AutopilotLink
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, parse_endpoint
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity
@@ -21,11 +24,15 @@ class Checkup:
         options: LinkOptions,
         *,
         lever_arm_m: tuple[float, float, float] | None,
-        latency_ms: float | None,
+        ages: Callable[[], Ages | None],
     ) -> None:
-        """Args: as of :class:`Situation`."""
+        """
+        Args:
+            lever_arm_m: as of :class:`Situation`.
+            ages: tells how old estimates are when they arrive, as soon as that is known.
+        """
         self._link, self._options = link, options
-        self._lever_arm_m, self._latency_ms = lever_arm_m, latency_ms
+        self._lever_arm_m, self._ages = lever_arm_m, ages
         endpoint = parse_endpoint(options.endpoint)
         self._baud = endpoint.port if endpoint.kind == "serial" else None
         self._found_ns: int | None = None
@@ -61,7 +68,7 @@ class Checkup:
             health=self._link.health(),
             readings=self._link.parameters()[0],
             lever_arm_m=self._lever_arm_m,
-            latency_ms=self._latency_ms,
+            ages=self._ages(),
             baud=self._baud,
             sensor_id=self._options.sensor_id,
         )

@@ -15,6 +15,8 @@ from ortholoc_edge.geometry.frames import ecef_from_geodetic, ned_from_ecef_rota
 _ARDUPILOT_RADIUS_M = math.degrees(0.011131884502145034 * 1e7)
 # PX4's CONSTANTS_RADIUS_OF_EARTH (lib/geo/geo.h).
 _PX4_RADIUS_M = 6371000.0
+# Origins this close are one: ten digits of the message's latitude, and far below what a fix can tell.
+_SAME_M = 0.1
 
 
 class EarthModel(StrEnum):
@@ -70,6 +72,14 @@ class GeodeticOrigin:
         _check_position("origin", self.latitude_deg, self.longitude_deg)
         if not math.isfinite(self.height_amsl_m):
             raise ValueError(f"origin height {self.height_amsl_m} is not finite")
+
+
+def is_same_origin(a: GeodeticOrigin, b: GeodeticOrigin) -> bool:
+    """Whether two origins are one but for rounding, which wavers by a digit of 1e-7 degrees (1 cm) or of 1 mm."""
+    north_m = math.radians(a.latitude_deg - b.latitude_deg) * _PX4_RADIUS_M
+    turn_deg = _wrap_deg(a.longitude_deg - b.longitude_deg)
+    east_m = math.radians(turn_deg) * _PX4_RADIUS_M * math.cos(math.radians(a.latitude_deg))
+    return math.hypot(north_m, east_m) <= _SAME_M and abs(a.height_amsl_m - b.height_amsl_m) <= _SAME_M
 
 
 def ned_from_geodetic(

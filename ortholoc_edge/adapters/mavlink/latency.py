@@ -76,6 +76,32 @@ class DelayAdvice:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class Ages:
+    """How old estimates are when they arrive, in ms: the least, the usual and the most."""
+
+    low_ms: float
+    middle_ms: float
+    high_ms: float
+
+
+def ages_of(mode: str, meter: LatencyMeter, fixed_latency_ms: float, round_trip_ns: int | None) -> Ages | None:
+    """For a mode of release; None where it must be measured, and no fix was sent yet.
+
+    To the age at sending comes half a round trip. "fast-forward" has no age at sending, "fixed-latency" the configured
+    one (but for fixes that come later), "raw" what is measured.
+    """
+    way_ms = 0.0 if round_trip_ns is None else round_trip_ns / _MS / 2.0
+    if mode == "fast-forward":
+        return Ages(way_ms, way_ms, way_ms)
+    low, middle, high = (meter.percentile_ms(p) for p in (5.0, 50.0, 99.0))
+    if mode == "fixed-latency":
+        return Ages(fixed_latency_ms + way_ms, fixed_latency_ms + way_ms, max(fixed_latency_ms, high or 0.0) + way_ms)
+    if low is None or middle is None or high is None:
+        return None
+    return Ages(low + way_ms, middle + way_ms, high + way_ms)
+
+
 def advise(
     autopilot: Autopilot, mode: str, meter: LatencyMeter, fixed_latency_ms: float, round_trip_ns: int | None
 ) -> DelayAdvice | None:
@@ -88,17 +114,13 @@ def advise(
       which it does not take: then it is the age at arrival. GLOBAL_POSITION_SENSOR is always stamped on arrival, so
       EKF2_AGPn_DELAY is that age: half a round trip of "fast-forward".
     """
-    low, middle, high = (meter.percentile_ms(p) for p in (5.0, 50.0, 99.0))
-    if low is None or middle is None or high is None:
+    ages = ages_of(mode, meter, fixed_latency_ms, round_trip_ns)
+    if ages is None or not len(meter):
         return None
     way_ms = 0.0 if round_trip_ns is None else round_trip_ns / _MS / 2.0
-    if mode == "fast-forward":
-        low = middle = high = 0.0
-    elif mode == "fixed-latency":
-        low, middle, high = fixed_latency_ms, fixed_latency_ms, max(fixed_latency_ms, high)
-    viso_ms = round(low + way_ms)
+    viso_ms = round(ages.low_ms)
     synchronised = 2.0 * way_ms < _PX4_MAX_ROUND_TRIP_MS
-    ev_ms = 0 if synchronised else round(middle + way_ms)
+    ev_ms = 0 if synchronised else round(ages.middle_ms)
     notes = []
     if autopilot is Autopilot.ARDUPILOT and viso_ms > _MAX_VISO_DELAY_MS:
         notes.append(
@@ -114,7 +136,7 @@ def advise(
         autopilot,
         min(viso_ms, _MAX_VISO_DELAY_MS),
         min(ev_ms, _MAX_EV_DELAY_MS),
-        min(round(middle + way_ms), _MAX_AGP_DELAY_MS),
-        max(math.ceil((high + way_ms) / 10.0) * 10, ev_ms),
+        min(round(ages.middle_ms), _MAX_AGP_DELAY_MS),
+        max(math.ceil(ages.high_ms / 10.0) * 10, ev_ms),
         "; ".join(notes),
     )

@@ -20,7 +20,7 @@ from ortholoc_edge.adapters.mavlink.codec import FrameParser, MavlinkMessage, di
 from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate
 from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin
 from ortholoc_edge.adapters.mavlink.gimbal import GimbalSelection
-from ortholoc_edge.adapters.mavlink.latency import DelayAdvice
+from ortholoc_edge.adapters.mavlink.latency import Ages, DelayAdvice
 from ortholoc_edge.adapters.mavlink.log import LimitedLog
 from ortholoc_edge.adapters.mavlink.monitor import FusionReport
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus, parse_endpoint
@@ -227,6 +227,24 @@ class AutopilotLink:
         """The delay parameters that the measured latency asks for; None before a fix was sent."""
         with self._lock:
             return self._protocol.delay_advice()
+
+    def ages(self) -> Ages | None:
+        """How old estimates are when they arrive: known of the mode of release, or measured; None before that."""
+        with self._lock:
+            return self._protocol.ages()
+
+    def trouble(self) -> str | None:
+        """Why nothing current is known of the vehicle, where the link is to blame; None where it is not."""
+        with self._lock:
+            if not self._open_ok:
+                return f"link endpoint {self._options.endpoint} is not open"
+            return self._protocol.trouble(self._clock.now_ns())
+
+    @property
+    def fixes_sent(self) -> int:
+        """How many fixes went out, each counted once however often it was carried on."""
+        with self._lock:
+            return self._protocol.counts["fixes_sent"]
 
     @property
     def restarts(self) -> int:
@@ -510,18 +528,22 @@ class AutopilotLink:
                 if self._protocol.connected(now_ns):
                     wall_ns = wall_clock_ns()
                     encoded = self._protocol.encode_estimate(outgoing.estimate, now_ns, wall_ns, self._recovery)
-                if encoded:
-                    self._recovery = False
-                    self._protocol.sent(outgoing, now_ns)
-                else:
+                if not encoded:
                     self._counts["estimates_dropped"] += 1
-                messages = encoded + messages
+            else:
+                encoded = []
             while self._texts:
                 messages.append(self._texts.popleft())
+        went_out = [self._send(transport, message) for message in encoded]
+        if outgoing is not None and any(went_out):
+            with self._lock:
+                self._recovery = False
+                self._protocol.sent(outgoing, now_ns)
         for message in messages:
             self._send(transport, message)
 
-    def _send(self, transport: Transport, message: MavlinkMessage) -> None:
+    def _send(self, transport: Transport, message: MavlinkMessage) -> bool:
+        """Whether the line took it."""
         self._mav.srcSystem = self._protocol.own_system_id
         if self._signing is not None:
             self._signing.sign_next(self._mav, self._clock.now_ns(), wall_clock_ns())
@@ -530,7 +552,8 @@ class AutopilotLink:
             self._mav.seq = (self._mav.seq + 1) % 256
             self._counts[f"sent.{message.get_type()}"] += 1
             self._counts[f"sent_bytes.{message.get_type()}"] += len(frame)
-        else:
-            self._counts["unsent"] += 1
-            if message.get_type() in _CARRY_ESTIMATES:
-                self._counts["estimates_dropped"] += 1
+            return True
+        self._counts["unsent"] += 1
+        if message.get_type() in _CARRY_ESTIMATES:
+            self._counts["estimates_dropped"] += 1
+        return False

@@ -39,7 +39,8 @@ class LinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
             ``serial:/dev/ttyX:BAUD``. Below 460800 baud there is little room for ODOMETRY and time
             synchronisation is poor.
         system_id: ours and the vehicle's (a component shares the system id of its vehicle); 0 adopts that of
-            the first autopilot heard.
+            the first autopilot heard, for the life of the process: an autopilot with another id, exchanged on the
+            bench, is served after a restart.
         component_id: 197 is MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY.
         send: which messages carry an estimate; "auto" alone takes the best that the autopilot's firmware reads.
         sensor_id: ours in GLOBAL_POSITION_SENSOR; PX4 wants it in EKF2_AGPn_ID.

@@ -53,6 +53,14 @@ class Outlet:
                 logger.warning("[link] recovery is on, but this autopilot knows no such command; none is sent")
         return self._sinks
 
+    def believed(self, vehicle: AutopilotIdentity) -> tuple[float, float]:
+        """The most that every chosen sink believes of a sigma of position, m, and of yaw, rad."""
+        bounds = [limits(sink, vehicle.autopilot, vehicle.firmware_version) for sink in self.sinks(vehicle)]
+        return (
+            min((bound.most_sigma_m for bound in bounds), default=math.inf),
+            min((bound.most_yaw_sigma_rad for bound in bounds), default=math.inf),
+        )
+
     def encode(
         self,
         estimate: VisionEstimate,

@@ -12,7 +12,7 @@ from ortholoc_edge.adapters.mavlink.codec import MavlinkMessage, dialect
 from ortholoc_edge.adapters.mavlink.estimates import Autopilot, VisionEstimate
 from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin
 from ortholoc_edge.adapters.mavlink.gimbal import GimbalSelection
-from ortholoc_edge.adapters.mavlink.latency import DelayAdvice, LatencyMeter, advise
+from ortholoc_edge.adapters.mavlink.latency import Ages, DelayAdvice, LatencyMeter, advise, ages_of
 from ortholoc_edge.adapters.mavlink.log import LimitedLog
 from ortholoc_edge.adapters.mavlink.monitor import FusionMonitor, FusionReport
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus
@@ -42,8 +42,6 @@ _AUTOPILOTS = {
 
 # An autopilot sends HEARTBEAT at 1 Hz; three missing is how ground stations judge it too.
 _SILENT_AFTER_NS = 3 * _S
-# With its own system id gone for this long, another autopilot on the link may take the place.
-_REPLACE_AFTER_NS = 10 * _S
 
 
 def _repeat_at(rate_hz: float) -> Repeat | None:
@@ -78,6 +76,8 @@ class LinkProtocol:
         self._vehicle: AutopilotIdentity | None = None
         self._heartbeat_ns = 0
         self._silent = False
+        # Other autopilots' system ids, each with when it was heard last.
+        self._others: dict[int, int] = {}
         self._offered_origin: GeodeticOrigin | None = None
         self._home_known = False
         self._streams: dict[str, Stream] = {}
@@ -98,7 +98,7 @@ class LinkProtocol:
             "COMMAND_ACK": self._on_command_ack,
             "PARAM_VALUE": self._on_parameter,
             "PARAM_ERROR": lambda m, arrival_ns: self.parameters.on_error(m),
-            "TIMESYNC": lambda m, arrival_ns: self.timesync.answered(m.tc1, m.ts1, arrival_ns),
+            "TIMESYNC": self._on_timesync,
         }
 
     # -- who we are and who they are --------------------
@@ -118,6 +118,23 @@ class LinkProtocol:
     def connected(self, now_ns: int) -> bool:
         """Whether the autopilot's heart beats."""
         return self._vehicle is not None and now_ns - self._heartbeat_ns <= _SILENT_AFTER_NS
+
+    def trouble(self, now_ns: int) -> str | None:
+        """Why nothing current is known of the vehicle, as far as that lies with the link; None if it does not."""
+        others = [system for system, at_ns in self._others.items() if now_ns - at_ns <= _SILENT_AFTER_NS]
+        heard = ", ".join(map(str, sorted(others)))
+        if self._vehicle is None:
+            if others:
+                return (
+                    f"the autopilot that is heard has system id {heard}, but [link] system_id is "
+                    f"{self._options.system_id}; set it to that, or to 0 to take the first"
+                )
+            return f"no autopilot heard on {self._options.endpoint}"
+        silent_ns = now_ns - self._heartbeat_ns
+        if silent_ns <= _SILENT_AFTER_NS:
+            return None
+        trouble = f"autopilot (system {self._vehicle.system_id}) silent since {silent_ns // _S} s"
+        return trouble + (f"; system {heard} is heard, but not served: restart us to take it" if others else "")
 
     # -- in --------------------
 
@@ -172,6 +189,8 @@ class LinkProtocol:
     def _on_heartbeat(self, message: MavlinkMessage, system: int, arrival_ns: int) -> None:
         if not self.is_vehicle_heartbeat(message):
             self.counts["ignored"] += 1
+            if self._is_another_autopilot(message):
+                self._others[system] = arrival_ns
             if self._vehicle is None and self._is_another_autopilot(message):
                 self._log(
                     arrival_ns,
@@ -186,10 +205,17 @@ class LinkProtocol:
         autopilot = said if self._options.autopilot == "auto" else Autopilot(self._options.autopilot)
         known = self._vehicle
         if known is not None and system != known.system_id:
-            if arrival_ns - self._heartbeat_ns < _REPLACE_AFTER_NS:
-                self.counts["other_vehicles"] += 1
-                return
-            known = None
+            # For the life of the process: where ours fell silent, another's attitude would be a neighbour's.
+            self._others[system] = arrival_ns
+            self.counts["other_vehicles"] += 1
+            self._log(
+                arrival_ns,
+                logging.WARNING,
+                "other_vehicle",
+                f"autopilots with system ids {known.system_id} and {system} are heard, and {known.system_id} is served "
+                f"since it was first; set [link] system_id. If the autopilot was exchanged, restart this program",
+            )
+            return
         if known is None or known.autopilot is not autopilot:
             if self._vehicle is not None:
                 self.telemetry.forget()
@@ -225,6 +251,14 @@ class LinkProtocol:
             timer.restart()
         self.parameters.restart()
         self._census.restart()
+
+    def _on_timesync(self, m: MavlinkMessage, arrival_ns: int) -> None:
+        resets = self.timesync.resets
+        self.timesync.answered(m.tc1, m.ts1, arrival_ns)
+        if self.timesync.resets != resets:
+            # What was stamped by the old clock can't be told from what comes now.
+            self.telemetry.forget()
+            self._start_over("its clock is another one (it stepped, or a restart went unheard)", arrival_ns)
 
     def _on_home(self, m: MavlinkMessage, arrival_ns: int) -> None:
         self._home_known = True
@@ -286,6 +320,7 @@ class LinkProtocol:
         ts1 = self.timesync.due(now_ns)
         if ts1 is not None:
             out.append(dialect.MAVLink_timesync_message(tc1=0, ts1=ts1))
+        self.release.believed = self._outlet.believed(vehicle)
         if vehicle.firmware_version is not None:
             # What is doubtful about the choice is told before the first estimate.
             self._outlet.sinks(vehicle)
@@ -326,6 +361,7 @@ class LinkProtocol:
         """An estimate was handed to the line."""
         self._last_sent = outgoing
         if outgoing.repeat == 0:
+            self.counts["fixes_sent"] += 1
             self.latency.add(now_ns - outgoing.capture_ns)
         if self._vehicle is not None:
             self.monitor.sent(outgoing.estimate, now_ns, self.state_at, self._vehicle.autopilot)
@@ -340,8 +376,14 @@ class LinkProtocol:
             return None
         return advise(
             self._vehicle.autopilot, self.release.mode, self.latency, self._options.fixed_latency_ms,
-            self.timesync.last_round_trip_ns,
+            self.timesync.median_round_trip_ns,
         )  # fmt: skip
+
+    def ages(self) -> Ages | None:
+        """How old estimates arrive, by which the delay parameters are to be set; None while it must be measured."""
+        return ages_of(
+            self.release.mode, self.latency, self._options.fixed_latency_ms, self.timesync.median_round_trip_ns
+        )
 
     def _tell_delays(self) -> None:
         advice = self.delay_advice()

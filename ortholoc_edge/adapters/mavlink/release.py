@@ -18,6 +18,8 @@ is to carry the fix on to the moment it is sent:
   the variance, whose sum of information is that of one fix, or a little less, however long the repeating goes on. To
   it belongs the error of the displacement, which is multiplied as well: the filter made the velocity it came from, so
   each repeat is correlated with its state.
+- A filter takes a sigma beyond its bound (10 m in ArduPilot before 4.7) for the bound. So where the parts of a fix
+  would be as small as that, fewer are made, each with more of it, and then none.
 - It ends when no new fix came for ``max_repeat_s``, the odometry's epoch or the origin changes.
 - A fix that can't be carried on goes once, as it was at its capture, with that stamp. An ArduPilot that was told of no
   latency takes it for new, so what the vehicle may have flown since is added to its sigma. Without this an autopilot
@@ -37,7 +39,7 @@ from statistics import median
 
 import numpy as np
 
-from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate
+from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate, horizontal_sigma_m, yaw_sigma_rad
 from ortholoc_edge.adapters.mavlink.geodesy import Place, moved
 from ortholoc_edge.adapters.mavlink.options import LinkOptions
 from ortholoc_edge.adapters.mavlink.state import AutopilotState
@@ -78,6 +80,12 @@ class _Taken:
     arrival_ns: int
     origin: object
     released: int = 0
+    share: float | None = None  # of each estimate, where it must be more than usual
+
+
+@dataclass(frozen=True, slots=True)
+class _Spent:
+    """What a fix knows was all told."""
 
 
 def shares(expected: int, index: int) -> float:
@@ -95,13 +103,16 @@ class Release:
     """What goes out between fixes. Pure: the owner (the link's thread, under its lock) tells the time and looks up.
 
     Attributes:
+        believed: the largest sigmas that the autopilot believes, of position, m, and of yaw, rad (`Outlet.believed`).
         counts: ``carried`` and ``repeated`` (estimates carried on: of new fixes, and again), ``raw_instead`` (fixes
             sent as they are because they could not be carried on), ``repeats_broken`` (ended by an epoch, an origin),
-            ``repeats_ended`` (no new fix), ``contradicted`` (displacements that two fixes contradict),
+            ``repeats_ended`` (no new fix), ``repeats_fewer`` (more would have had sigmas beyond what is believed),
+            ``contradicted`` (displacements that two fixes contradict),
             ``bad_capture_stamps``, ``late_for_release``.
     """
 
     def __init__(self, options: LinkOptions) -> None:
+        self.believed = (math.inf, math.inf)
         self.mode = "raw" if options.estimate_rate_hz == 0.0 else options.release
         self.counts: Counter[str] = Counter()
         self._period_ns = round(_S / options.estimate_rate_hz) if options.estimate_rate_hz > 0.0 else 0
@@ -178,6 +189,10 @@ class Release:
         if self._next_ns - now_ns < self._period_ns // 2:
             self._next_ns += self._period_ns
         carried = self._carried(fix, now_ns, look)
+        if isinstance(carried, _Spent):
+            self.counts["repeats_fewer"] += 1
+            self._fix = None
+            return None
         if carried is None:
             self._fix = None
             if fix.released > 0:
@@ -194,7 +209,24 @@ class Release:
         typical_ns = median(self._intervals_ns) if self._intervals_ns else self._max_repeat_ns
         return max(1, math.ceil(typical_ns / self._period_ns - 1e-9))
 
-    def _carried(self, fix: _Taken, now_ns: int, look: Look) -> VisionEstimate | None:
+    def _share(self, fix: _Taken, estimate: VisionEstimate) -> float | _Spent:
+        """The part of the fix's information for the next estimate of it, ``estimate`` before it is divided.
+
+        A filter that bounds sigmas would take a larger one for the bound, and believe more than we say. So no part is
+        so small: fewer estimates are made, the first of them even of the whole fix.
+        """
+        most_m, most_rad = self.believed
+        needed = max((horizontal_sigma_m(estimate) / most_m) ** 2, (yaw_sigma_rad(estimate) / most_rad) ** 2)
+        needed *= 1.0 + 1e-9  # so that rounding does not lift a sigma over its bound
+        if fix.released == 0 and shares(self._expected(), 0) < needed:
+            fix.share = 1.0 / max(1, math.floor(1.0 / needed))
+        if fix.share is None:
+            share = shares(self._expected(), fix.released)
+            return share if share >= needed else _Spent()
+        spent = fix.released and (fix.share < needed or (fix.released + 1) * fix.share > 1.0 + 1e-9)
+        return _Spent() if spent else fix.share
+
+    def _carried(self, fix: _Taken, now_ns: int, look: Look) -> VisionEstimate | _Spent | None:
         # Both looked up now, so that both are related to our clock in the same way.
         then, now = look(fix.estimate.stamp_ns), look(now_ns)
         if self._in_doubt or then is None or now is None or now.origin != fix.origin:
@@ -203,7 +235,10 @@ class Release:
         if step is None or then.ned_from_body is None or now.ned_from_body is None:
             return None
         elapsed_s = (now_ns - fix.estimate.stamp_ns) / _S
-        covariance = fix.estimate.covariance + _noise(step, elapsed_s)
+        whole = replace(fix.estimate, covariance=fix.estimate.covariance + _noise(step, elapsed_s))
+        share = self._share(fix, whole)
+        if isinstance(share, _Spent):
+            return share
         return replace(
             fix.estimate,
             stamp_ns=now_ns,
@@ -212,7 +247,7 @@ class Release:
             position_ned_m=None if fix.estimate.position_ned_m is None else fix.estimate.position_ned_m + step,
             place=None if fix.estimate.place is None else _moved(fix.estimate.place, step),
             ned_from_body=_turned(fix.estimate.ned_from_body, then.ned_from_body, now.ned_from_body),
-            covariance=covariance / shares(self._expected(), fix.released),
+            covariance=whole.covariance / share,
         )
 
     def _compare(self, old: VisionEstimate, new: VisionEstimate, look: Look) -> None:

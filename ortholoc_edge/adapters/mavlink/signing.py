@@ -17,6 +17,8 @@ from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
 
+import msgspec
+
 from ortholoc_edge.adapters.mavlink.codec import MavlinkMessage, dialect
 from ortholoc_edge.adapters.mavlink.options import LinkOptions
 from ortholoc_edge.errors import ConfigError
@@ -264,6 +266,34 @@ def read_key(name: str, environ: Mapping[str, str]) -> bytes:
     return key
 
 
+def _state_path(options: LinkOptions, environ: Mapping[str, str]) -> Path:
+    if options.signing_state is not None:
+        return Path(options.signing_state)
+    if environ.get("STATE_DIRECTORY"):
+        # systemd separates several by colons.
+        return Path(environ["STATE_DIRECTORY"].split(":")[0]) / "mavlink-signing"
+    raise ConfigError(
+        "[link] signing_state: name a file for signing's stamps, which must never repeat; only under systemd with "
+        "StateDirectory= is there a place for it by itself"
+    )
+
+
+def beside(options: LinkOptions, name: str, environ: Mapping[str, str]) -> LinkOptions:
+    """The options for another program on the same link and with the same key: stamps and a link id of its own.
+
+    Two that kept one file of stamps would each overwrite what the other needs after a restart.
+    Raises: ConfigError where stamps have no place.
+    """
+    if options.signing_key is None:
+        return options
+    path = _state_path(options, environ)
+    return msgspec.structs.replace(
+        options,
+        signing_link_id=(options.signing_link_id + 128) % 256,
+        signing_state=str(path.with_name(f"{path.name}.{name}")),
+    )
+
+
 def make_signing(options: LinkOptions, environ: Mapping[str, str]) -> Signing | None:
     """As configured; None without a key.
 
@@ -273,15 +303,5 @@ def make_signing(options: LinkOptions, environ: Mapping[str, str]) -> Signing | 
         if options.require_signed:
             raise ConfigError("[link] require_signed needs signing_key: without a key no signature can be checked")
         return None
-    key = read_key(options.signing_key, environ)
-    if options.signing_state is not None:
-        path = Path(options.signing_state)
-    elif environ.get("STATE_DIRECTORY"):
-        # systemd separates several by colons.
-        path = Path(environ["STATE_DIRECTORY"].split(":")[0]) / "mavlink-signing"
-    else:
-        raise ConfigError(
-            "[link] signing_state: name a file for signing's stamps, which must never repeat; only under systemd with "
-            "StateDirectory= is there a place for it by itself"
-        )
+    key, path = read_key(options.signing_key, environ), _state_path(options, environ)
     return Signing(key, options.signing_link_id, StampStore(path), require_signed=options.require_signed)

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import logging
 import math
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
+from ortholoc_edge.adapters.mavlink.clockwatch import ClockWatch, Stamp
 from ortholoc_edge.adapters.mavlink.codec import MavlinkMessage, dialect
-from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin, moved
+from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin, is_same_origin, moved
 from ortholoc_edge.adapters.mavlink.gimbal import GIMBAL_MESSAGES, Gimbal, GimbalSelection
 from ortholoc_edge.adapters.mavlink.history import TimeHistory, choose
 from ortholoc_edge.adapters.mavlink.log import LimitedLog
@@ -50,7 +51,8 @@ _MAX_SPEED_M_S = 500.0
 # Later than the newest sample by this much, time_boot_ms has gone back: the autopilot restarted.
 _BOOT_BACK_NS = 1 * _S
 _STAMP_AHEAD_NS = 1 * _S
-_ORIGIN_MOVED_M = 0.1
+# Ten a second for as long as frames are asked about.
+_GPS_CAPACITY = 100
 
 
 def _is_position(latitude_e7: int, longitude_e7: int) -> bool:
@@ -128,10 +130,12 @@ class Telemetry:
         self._armed = False
         self._landed: bool | None = None
         self._origin: GeodeticOrigin | None = None
-        self._gps_raw: _GpsRaw | None = None
+        self._gps_raws: deque[_GpsRaw] = deque(maxlen=_GPS_CAPACITY)
         self._estimator: tuple[int, float] | None = None
         self._epoch = 0
         self._newest_boot_ns: int | None = None
+        self._watch = ClockWatch(timesync)
+        self._unconfirmed_after_ns: int | None = None
         self._ahead_in_a_row = 0
         self._quaternion_ns: int | None = None
         # Twice what was asked for, as some stacks send more; and no less than 20 Hz.
@@ -183,9 +187,11 @@ class Telemetry:
         self._break_odometry()
         self._last_local = None
         self._newest_boot_ns = None
+        self._watch.forget()
+        self._unconfirmed_after_ns = None
         self._ahead_in_a_row = 0
         self._origin = None
-        self._gps_raw = None
+        self._gps_raws.clear()
         self._estimator = None
         self._landed = None
         self._quaternion_ns = None
@@ -205,6 +211,8 @@ class Telemetry:
         best = self._timesync.best(stamp_ns) if self._timesync.synchronised else None
         by_boot = best is not None
         time_ns = stamp_ns + best[0] if best is not None else stamp_ns
+        if by_boot and self._unconfirmed_after_ns is not None and time_ns > self._unconfirmed_after_ns:
+            return self._unknown(stamp_ns)
         attitude, interpolated = self._attitude_at(time_ns, by_boot)
         position, velocity, epoch = self._local_at(time_ns, by_boot)
         odometry, odometry_epoch = self._odometry_at(time_ns, by_boot)
@@ -230,6 +238,27 @@ class Telemetry:
             gimbal_sigma_rad=0.0 if gimbal is None else gimbal.sigma_rad,
         )
 
+    def _unknown(self, stamp_ns: int) -> AutopilotState:
+        """While it is open what time the autopilot's stamps mean."""
+        return AutopilotState(
+            stamp_ns=stamp_ns,
+            ned_from_body=None,
+            interpolated=False,
+            velocity_ned=None,
+            local_position_ned_m=None,
+            local_epoch=self._epoch,
+            odometry_ned_m=None,
+            odometry_epoch=self._odometry_epoch,
+            gnss=None,
+            origin=self._origin,
+            armed=self._armed,
+            landed=self._landed,
+            synchronised=False,
+            sync_uncertainty_ns=None,
+            estimator_flags=self._estimator[0] if self._estimator else None,
+            position_test_ratio=self._estimator[1] if self._estimator else None,
+        )
+
     # -- in --------------------
 
     def _on_heartbeat(self, m: MavlinkMessage, arrival_ns: int) -> None:
@@ -239,7 +268,7 @@ class Telemetry:
         self._restart = why
         self.forget()
 
-    def _boot_ns(self, time_boot_ms: int, arrival_ns: int) -> int | None:
+    def _boot_ns(self, name: str, time_boot_ms: int, arrival_ns: int) -> int | None:
         """Boot time of a sample; notices restarts. None if the stamp can't be true."""
         boot_ns = time_boot_ms * _MS
         best = self._timesync.best(arrival_ns) if self._timesync.synchronised else None
@@ -255,6 +284,20 @@ class Telemetry:
             self._ahead_in_a_row = 0
         if self._newest_boot_ns is not None and boot_ns < self._newest_boot_ns - _BOOT_BACK_NS:
             self._restarted("restarted (its boot time went back)")
+        else:
+            stamp = self._watch.judge(name, boot_ns, arrival_ns)
+            if stamp is Stamp.FALSE:
+                self._counts["bad_stamps"] += 1
+                self._log(
+                    arrival_ns, logging.WARNING, "stamp",
+                    f"autopilot sent {name} with a stamp of no time that it may have; dropped, and its clock asked for",
+                )  # fmt: skip
+                return None
+            if stamp is Stamp.GOOD:
+                self._unconfirmed_after_ns = None
+            elif self._unconfirmed_after_ns is None:
+                self._counts["clock_doubts"] += 1
+                self._unconfirmed_after_ns = self._newest_boot_ns or 0
         self._newest_boot_ns = max(boot_ns, self._newest_boot_ns or 0)
         return boot_ns
 
@@ -273,7 +316,7 @@ class Telemetry:
             self._garbage(name, arrival_ns, f"quaternion {[w, x, y, z]}")
             return
         p, q_rate, r = (float(v) if math.isfinite(v) else 0.0 for v in rates)
-        boot_ns = self._boot_ns(boot_ms, arrival_ns)
+        boot_ns = self._boot_ns(name, boot_ms, arrival_ns)
         if boot_ns is None:
             return
         sample = _Attitude((w / norm, x / norm, y / norm, z / norm), (p, q_rate, r))
@@ -312,7 +355,7 @@ class Telemetry:
             if not (np.abs(values[3:]) <= _MAX_SPEED_M_S).all():
                 self._break_odometry()
             return
-        boot_ns = self._boot_ns(m.time_boot_ms, arrival_ns)
+        boot_ns = self._boot_ns("LOCAL_POSITION_NED", m.time_boot_ms, arrival_ns)
         if boot_ns is None:
             return
         position, velocity = values[:3], values[3:]
@@ -376,15 +419,17 @@ class Telemetry:
             vertical = 2.0 * horizontal  # the geometry of satellites above the horizon
         if not _is_position(m.lat, m.lon):
             self._counts["empty.GPS_RAW_INT"] += 1
-        self._gps_raw = _GpsRaw(
-            arrival_ns,
-            self._fix_boot_ns(m.time_usec * 1000),
-            m.fix_type if _is_position(m.lat, m.lon) else dialect.GPS_FIX_TYPE_NO_FIX,
-            m.lat / 1e7,
-            m.lon / 1e7,
-            m.alt / 1e3,
-            horizontal,
-            vertical,
+        self._gps_raws.append(
+            _GpsRaw(
+                arrival_ns,
+                self._fix_boot_ns(m.time_usec * 1000),
+                m.fix_type if _is_position(m.lat, m.lon) else dialect.GPS_FIX_TYPE_NO_FIX,
+                m.lat / 1e7,
+                m.lon / 1e7,
+                m.alt / 1e3,
+                horizontal,
+                vertical,
+            )
         )
 
     def _fix_boot_ns(self, time_ns: int) -> int | None:
@@ -404,6 +449,8 @@ class Telemetry:
             return
         origin = GeodeticOrigin(m.latitude / 1e7, m.longitude / 1e7, m.altitude / 1e3)
         old = self._origin
+        if old is not None and is_same_origin(old, origin):
+            return  # what was told first stands, so that a last digit that wavers is no news to anybody
         self._origin = origin
         if old is None:
             logger.info(
@@ -413,17 +460,13 @@ class Telemetry:
                 origin.height_amsl_m,
             )
             return
-        moved_m = 111e3 * max(
-            abs(origin.latitude_deg - old.latitude_deg), abs(origin.longitude_deg - old.longitude_deg)
-        )
-        if max(moved_m, abs(origin.height_amsl_m - old.height_amsl_m)) > _ORIGIN_MOVED_M:
-            # Positions before and after refer to different zeros, even if no jump shows.
-            self._epoch += 1
-            self._counts["origin_moves"] += 1
-            self._log(arrival_ns, logging.WARNING, "origin", "autopilot's origin moved")
+        # Positions before and after refer to different zeros, even if no jump shows.
+        self._epoch += 1
+        self._counts["origin_moves"] += 1
+        self._log(arrival_ns, logging.WARNING, "origin", "autopilot's origin moved")
 
     def _on_system_time(self, m: MavlinkMessage, arrival_ns: int) -> None:
-        self._boot_ns(m.time_boot_ms, arrival_ns)
+        self._boot_ns("SYSTEM_TIME", m.time_boot_ms, arrival_ns)
 
     def _on_extended_state(self, m: MavlinkMessage, arrival_ns: int) -> None:
         on_ground = dialect.MAV_LANDED_STATE_ON_GROUND
@@ -439,7 +482,7 @@ class Telemetry:
     def _on_gimbal(self, m: MavlinkMessage, arrival_ns: int) -> None:
         assert self.gimbal is not None
         # Some firmware leaves the stamp of MOUNT_ORIENTATION out.
-        boot_ns = self._boot_ns(m.time_boot_ms, arrival_ns) if m.time_boot_ms else None
+        boot_ns = self._boot_ns(m.get_type(), m.time_boot_ms, arrival_ns) if m.time_boot_ms else None
         if boot_ns is not None or not m.time_boot_ms:
             self.gimbal.take(m, boot_ns, arrival_ns)
 
@@ -490,7 +533,8 @@ class Telemetry:
         return frozen_floats(position, (3,), "position"), frozen_floats(velocity, (3,), "velocity"), a.epoch
 
     def _gnss_at(self, stamp_ns: int, time_ns: int, by_boot: bool) -> GnssPosition | None:
-        raw = self._gps_raw
+        # Of the stamp, not the latest: a frame that waited is older than it. The later of two that fit alike.
+        raw = min(reversed(self._gps_raws), key=lambda raw: abs(stamp_ns - raw.arrival_ns), default=None)
         if (
             raw is None
             or abs(stamp_ns - raw.arrival_ns) > _GNSS_FRESH_NS

@@ -16,18 +16,20 @@ class TimeSync:
     """
 
     _DRIFT = 50e-6  # of two crystals, relative; a bad pair
-    _FAST_NS, _SLOW_NS = 100 * _MS, 1 * _S
+    _HURRIED_NS, _FAST_NS, _SLOW_NS = 50 * _MS, 100 * _MS, 1 * _S
     _SAMPLES_FAST = 10
     _SAMPLES_NEEDED = 5
     _MAX_ROUND_TRIP_NS = 1 * _S
     _JUMP_SLACK_NS = 2 * _MS
     _JUMPS_TO_RESET = 3
+    _AGREEMENTS_TO_CALM = 2
 
     def __init__(self) -> None:
         self._samples: deque[tuple[int, int, int]] = deque(maxlen=64)
-        self._asked: deque[int] = deque(maxlen=8)
+        self._asked: deque[int] = deque(maxlen=32)
         self._next_ns = 0
-        self._disagreeing = 0
+        self._disagreeing = self._agreeing = 0
+        self._hurried_since_ns: int | None = None
         self.last_round_trip_ns: int | None = None
         self.resets = 0
 
@@ -35,8 +37,23 @@ class TimeSync:
         """Forget everything; ask fast again."""
         self._samples.clear()
         self._asked.clear()
-        self._disagreeing = 0
+        self._disagreeing = self._agreeing = 0
+        self._hurried_since_ns = None
         self._next_ns = 0
+
+    def hurry(self, now_ns: int) -> None:
+        """The autopilot's clock is in doubt: ask fast until the answers agree with those before, or all do not."""
+        if self._hurried_since_ns is None:
+            self._hurried_since_ns, self._agreeing, self._next_ns = now_ns, 0, 0
+
+    @property
+    def hurried(self) -> bool:
+        """Whether the doubt is not yet settled."""
+        return self._hurried_since_ns is not None
+
+    def calm(self) -> None:
+        """The doubt is settled otherwise."""
+        self._hurried_since_ns = None
 
     @property
     def synchronised(self) -> bool:
@@ -52,7 +69,11 @@ class TimeSync:
         """The ts1 of a request to send now, or None."""
         if now_ns < self._next_ns:
             return None
-        self._next_ns = now_ns + (self._FAST_NS if len(self._samples) < self._SAMPLES_FAST else self._SLOW_NS)
+        if self._hurried_since_ns is not None:
+            pause_ns = self._HURRIED_NS
+        else:
+            pause_ns = self._FAST_NS if len(self._samples) < self._SAMPLES_FAST else self._SLOW_NS
+        self._next_ns = now_ns + pause_ns
         self._asked.append(now_ns)
         return now_ns
 
@@ -70,11 +91,17 @@ class TimeSync:
         if best is not None and abs(offset - best[0]) > best[1] + round_trip // 2 + self._JUMP_SLACK_NS:
             # One may be a broken stamp. Several in a row: the autopilot's clock is another one than before.
             self._disagreeing += 1
+            self._agreeing = 0
             if self._disagreeing < self._JUMPS_TO_RESET:
+                self.hurry(arrival_ns)
                 return
             self.reset()
             self.resets += 1
         self._disagreeing = 0
+        if self._hurried_since_ns is not None and ts1_ns >= self._hurried_since_ns:
+            self._agreeing += 1
+            if self._agreeing >= self._AGREEMENTS_TO_CALM:
+                self.calm()
         self._samples.append((offset, round_trip, arrival_ns))
 
     def best(self, now_ns: int) -> tuple[int, int] | None:
