@@ -34,8 +34,8 @@ class GateOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     min_inliers: Annotated[int, Meta(ge=6)] = 30
     min_inlier_ratio: Annotated[float, Meta(ge=0, le=1)] = 0.20
     # Of structural matching, in place of the two above: how much better the view fits at the pose than beside it, in
-    # sigmas, and the part of the patches in view that agree. Of 10,000 hostile frames the false poses without a rival had
-    # a contrast of 8.3 at most and a support of 0.076; of 1031 right ones, most of them of another season, these limits
+    # sigmas, and the part of the patches in view that agree. Of 10,000 hostile frames the false poses without a rival
+    # had a contrast of 8.3 at most and a support of 0.076; of 1031 right ones, most of another season, these limits
     # refuse 19 (docs/studies/structural.md, "Contrast").
     min_contrast: Annotated[float, Meta(ge=0)] = 10.5
     min_support: Annotated[float, Meta(ge=0, le=1)] = 0.03
