@@ -453,13 +453,13 @@ class Daemon:
         systemd.notify(f"STATUS={status}, {self._counts['fixes']} fixes, {self._counts['rejected']} rejected")
         if self._link.connected():
             self._report_damage()
-            self._report_autopilot(now_ns, fresh)
+            self._report_autopilot(now_ns)
             self._report_audit(now_ns)
         if self._origin_missing and self._link.connected():
             self._link.send_status_text(Severity.WARNING, "OrthoLoC: EKF origin unknown, fixes not sent")
             self._origin_missing = False
 
-    def _report_autopilot(self, now_ns: int, fixes_fresh: bool) -> None:
+    def _report_autopilot(self, now_ns: int) -> None:
         """Say and publish what the autopilot does with the fixes and whether GNSS agrees with them; switch its source
         if that was enabled."""
         fusion, witness = self._link.fusion, self._navigator.tracker.witness.report
@@ -468,6 +468,8 @@ class Daemon:
             self._link.send_status_text(severity, text)
         vehicle = self._link.vehicle
         autopilot = vehicle.autopilot if vehicle else None
+        # Not what we know of where we are, but what the autopilot was told: a set without fixes is no position at all.
+        fixes_fresh = self._link.estimate_sent_since(now_ns - _FRESH_FIX_NS)
         switch = self._sources.decide(witness.state, fixes_fresh, autopilot, self._link.restarts, now_ns)
         if switch is not None:
             logger.warning("%s", switch.text)

@@ -16,14 +16,14 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import msgspec
 import numpy as np
 import pytest
 from adapters.fake_autopilot import PtyWire, UdpWire, Wire, dialect
-from adapters.firmware_parameters import ARDUPILOT_STOCK
+from adapters.firmware_parameters import ARDUPILOT_READY, ARDUPILOT_STOCK
 from adapters.hovering import PITCH, PLACE, ROLL, TRUE_NED, TRUTH, YAW, HoveringAutopilot, config, running, wait_for
 from replay import rendered
 
@@ -256,10 +256,11 @@ def test_gnss_on_another_continent_is_survived(folder: Path, monkeypatch: pytest
 class _SpoofedAutopilot(HoveringAutopilot):
     """Its GNSS is ``beside_m`` to the north; keeps commands for the EKF's source set."""
 
-    def __init__(self, wire: Wire) -> None:
+    def __init__(self, wire: Wire, with_origin: bool = True) -> None:
         self.beside_m = 0.0
         self.source_sets: list[int] = []
-        super().__init__(wire)
+        super().__init__(wire, with_origin)
+        self.parameters = {**ARDUPILOT_READY, "EK3_SRC3_POSXY": 6}
 
     def _stream(self, message_id: int, now_ns: int) -> Any:
         message = super()._stream(message_id, now_ns)
@@ -273,9 +274,7 @@ class _SpoofedAutopilot(HoveringAutopilot):
         super()._take(message)
 
 
-def test_spoofed_gnss_is_told_and_the_source_switched_where_enabled(folder: Path) -> None:
-    wire = UdpWire()
-    autopilot = _SpoofedAutopilot(wire)
+def switching(folder: Path, wire: UdpWire) -> Daemon:
     base = config(
         f"folder:{folder}", f"udpout:127.0.0.1:{wire.port}",
         # Fewer frames than in flight: it is the same with its own limits (tests/pipeline/test_witness.py).
@@ -286,7 +285,32 @@ def test_spoofed_gnss_is_told_and_the_source_switched_where_enabled(folder: Path
         camera=CameraOptions(source=f"folder:{folder}", rate_hz=2.0),
         link=msgspec.structs.replace(base.link, switch_sources=True, vision_source_set=3),
     )
-    daemon = Daemon(enabled)
+    return Daemon(enabled)
+
+
+def test_no_switch_to_vision_while_no_estimate_goes_out(folder: Path) -> None:
+    """Fixes there are, and GNSS is bad; but without an origin the filter gets none of them."""
+    wire = UdpWire()
+    autopilot = _SpoofedAutopilot(wire, with_origin=False)
+    daemon = switching(folder, wire)
+    try:
+        with running(daemon):
+            wait_for(lambda: cast(int, daemon.statistics().get("fixes", 0)) >= 2, "two fixes")
+            autopilot.beside_m = 40.0
+            wait_for(lambda: daemon.statistics()["gnss_consistency"] == "bad", "GNSS found bad", 40.0)
+            wait_for(lambda: any("GNSS contradicts camera" in str(m.text) for m in autopilot.messages("STATUSTEXT")),
+                     "a word about it")  # fmt: skip
+            beats = len(autopilot.messages("HEARTBEAT"))
+            wait_for(lambda: len(autopilot.messages("HEARTBEAT")) >= beats + 2, "two seconds more")
+    finally:
+        autopilot.close()
+    assert autopilot.source_sets == []
+
+
+def test_spoofed_gnss_is_told_and_the_source_switched_where_enabled(folder: Path) -> None:
+    wire = UdpWire()
+    autopilot = _SpoofedAutopilot(wire)
+    daemon = switching(folder, wire)
     try:
         with running(daemon):
             wait_for(lambda: autopilot.messages("ODOMETRY"), "an estimate")

@@ -216,6 +216,12 @@ class AutopilotLink:
             self._recovery |= recovery
         self._wake()
 
+    def estimate_sent_since(self, since_ns: int) -> bool:
+        """Whether an estimate left the link after ``since_ns``: the line took it, whatever became of it there."""
+        with self._lock:
+            sent_ns = self._protocol.last_sent_ns
+        return sent_ns is not None and sent_ns > since_ns
+
     @property
     def fusion(self) -> FusionReport:
         """What the autopilot's filter does with our fixes."""
@@ -535,7 +541,9 @@ class AutopilotLink:
             while self._texts:
                 messages.append(self._texts.popleft())
         went_out = [self._send(transport, message) for message in encoded]
-        if outgoing is not None and any(went_out):
+        # Not the command of a recovery, which may have gone before it.
+        is_out = any(ok and m.get_type() in _CARRY_ESTIMATES for m, ok in zip(encoded, went_out, strict=True))
+        if outgoing is not None and is_out:
             with self._lock:
                 self._recovery = False
                 self._protocol.sent(outgoing, now_ns)

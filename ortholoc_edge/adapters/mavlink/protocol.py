@@ -61,6 +61,7 @@ class LinkProtocol:
         self.system_status = SystemStatus.BOOT
         self.computer: ComputerStatus | None = None
         self._last_sent: Outgoing | None = None
+        self.last_sent_ns: int | None = None
         self.timesync = TimeSync()
         self.counts: Counter[str] = Counter()
         self.telemetry = Telemetry(
@@ -359,7 +360,7 @@ class LinkProtocol:
 
     def sent(self, outgoing: Outgoing, now_ns: int) -> None:
         """An estimate was handed to the line."""
-        self._last_sent = outgoing
+        self._last_sent, self.last_sent_ns = outgoing, now_ns
         if outgoing.repeat == 0:
             self.counts["fixes_sent"] += 1
             self.latency.add(now_ns - outgoing.capture_ns)
