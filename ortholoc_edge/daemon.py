@@ -36,7 +36,7 @@ from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate
 from ortholoc_edge.adapters.mavlink.geodesy import EarthModel, GeodeticOrigin, Place, is_same_origin, ned_from_geodetic
 from ortholoc_edge.adapters.mavlink.herald import Herald
 from ortholoc_edge.adapters.mavlink.sinks import earth_model
-from ortholoc_edge.adapters.mavlink.sources import SourceSwitch
+from ortholoc_edge.adapters.mavlink.sources import SourceSwitch, Withheld
 from ortholoc_edge.adapters.recorder import Recorder
 from ortholoc_edge.clock import Clock, SystemClock
 from ortholoc_edge.config import Config
@@ -52,7 +52,7 @@ from ortholoc_edge.pipeline.localizer import Localizer
 from ortholoc_edge.pipeline.navigator import Navigator
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.tracker import Tracker, TrackerStatus
-from ortholoc_edge.pipeline.witness import WitnessReport
+from ortholoc_edge.pipeline.witness import Consistency, WitnessReport
 from ortholoc_edge.pose import pnp
 from ortholoc_edge.tiles.georeference import Georeference
 from ortholoc_edge.tiles.pack import Pack
@@ -466,18 +466,40 @@ class Daemon:
         for severity, text in self._herald.tell(fusion, witness):
             logger.log(logging.INFO if severity >= Severity.NOTICE else logging.WARNING, "%s", text)
             self._link.send_status_text(severity, text)
-        vehicle = self._link.vehicle
-        autopilot = vehicle.autopilot if vehicle else None
-        # Not what we know of where we are, but what the autopilot was told: a set without fixes is no position at all.
-        fixes_fresh = self._link.estimate_sent_since(now_ns - _FRESH_FIX_NS)
-        switch = self._sources.decide(witness.state, fixes_fresh, autopilot, self._link.restarts, now_ns)
-        if switch is not None:
-            logger.warning("%s", switch.text)
-            self._counts[f"switched_to_{switch.source}"] += 1
-            self._link.take_source_set(switch.number)
-            self._link.send_status_text(Severity.WARNING, switch.text)
+        self._switch_sources(witness.state, now_ns)
         if self._bus is not None:
             self._bus.publish_autopilot(autopilot_record(now_ns, self._link, witness, self._sources.on_vision))
+
+    def _switch_sources(self, consistency: Consistency, now_ns: int) -> None:
+        """Command the autopilot's source set where that was enabled; announce what it took."""
+        outcome = self._link.source_set_outcome()
+        if outcome is not None:
+            taken = self._sources.settle(outcome, now_ns)
+            if taken is not None:
+                logger.warning("%s", taken.text)
+                self._counts[f"switched_to_{taken.source}"] += 1
+                self._link.send_status_text(Severity.WARNING, taken.text)
+            elif not outcome.accepted:
+                why = "no answer" if outcome.answer is None else f"result {outcome.answer}"
+                logger.warning("EKF source set %d was not taken (%s); tried again later", outcome.number, why)
+                self._counts["switches_not_taken"] += 1
+        vehicle, number = self._link.vehicle, self._config.link.vision_source_set
+        reading = self._link.parameters()[0].get(f"EK3_SRC{number}_POSXY")
+        switch = self._sources.decide(
+            consistency,
+            # Not what we know of where we are, but what the autopilot was told: a set without fixes is no position.
+            self._link.estimate_sent_since(now_ns - _FRESH_FIX_NS),
+            vehicle.autopilot if vehicle else None,
+            self._link.restarts,
+            now_ns,
+            vision_posxy=None if reading is None else reading.value,
+        )
+        if isinstance(switch, Withheld):
+            logger.warning("%s: set it, or [link] vision_source_set; GNSS is bad and stays in use", switch.text)
+            self._link.send_status_text(Severity.WARNING, switch.text)
+        elif switch is not None:
+            logger.warning("commanding EKF source set %d (%s)", switch.number, switch.source)
+            self._link.take_source_set(switch.number)
 
     def _report_audit(self, now_ns: int) -> None:
         """Say once what is wrong with the autopilot's settings; of its delays as soon as our latency is known."""

@@ -25,6 +25,7 @@ from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin, Place
 from ortholoc_edge.adapters.mavlink.history import TimeHistory
 from ortholoc_edge.adapters.mavlink.options import parse_endpoint
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol
+from ortholoc_edge.adapters.mavlink.sources import Outcome
 from ortholoc_edge.adapters.mavlink.timesync import TimeSync
 from ortholoc_edge.clock import SystemClock
 from ortholoc_edge.errors import ConfigError, LinkError
@@ -933,9 +934,16 @@ def test_source_set_is_commanded_until_acknowledged(caplog):
     script.protocol.source_set.ask(2)
     script.run(2.5)
     assert script.commands(42007) == [2, 2, 2]
-    script.hear(dialect.MAVLink_command_ack_message(42007, dialect.MAV_RESULT_DENIED))
+    # Of another's commands: a ground station's, and the camera's beside us.
+    for others in ((255, 190), (7, 100)):
+        script.hear(dialect.MAVLink_command_ack_message(42007, 0, 0, 0, *others))
+    assert script.protocol.source_set.take_outcome() is None
+    script.run(1.0)
+    assert script.commands(42007) == [2, 2, 2, 2]
+    script.hear(dialect.MAVLink_command_ack_message(42007, dialect.MAV_RESULT_DENIED, 0, 0, 7, 197))
     script.run(5.0)
-    assert script.commands(42007) == [2, 2, 2]
+    assert script.commands(42007) == [2, 2, 2, 2]
+    assert script.protocol.source_set.take_outcome() == Outcome(2, False, dialect.MAV_RESULT_DENIED)
     assert "refuses to take EKF source set 2" in caplog.text
 
 

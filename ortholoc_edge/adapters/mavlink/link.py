@@ -28,6 +28,7 @@ from ortholoc_edge.adapters.mavlink.parameters import Number, Reading, Written
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol, Statistic
 from ortholoc_edge.adapters.mavlink.signing import ACCEPTED, STORE_INTERVAL_S, Verdict, make_signing
 from ortholoc_edge.adapters.mavlink.sinks import Sink
+from ortholoc_edge.adapters.mavlink.sources import Outcome
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity, AutopilotState
 from ortholoc_edge.adapters.mavlink.transport import Transport, open_transport
 from ortholoc_edge.clock import Clock, wall_clock_ns
@@ -266,10 +267,16 @@ class AutopilotLink:
             return meter.percentile_ms(50.0), meter.percentile_ms(99.0)
 
     def take_source_set(self, number: int) -> None:
-        """Command an ArduPilot to use a source set; repeated until it answers."""
+        """Command an ArduPilot to use a source set; repeated until it answers, five times at most. What came of it
+        is told by :meth:`source_set_outcome`."""
         with self._lock:
             self._protocol.source_set.ask(number)
         self._wake()
+
+    def source_set_outcome(self) -> Outcome | None:
+        """Of a :meth:`take_source_set` that came to its end since the last call, if one did."""
+        with self._lock:
+            return self._protocol.source_set.take_outcome()
 
     def send_status_text(self, severity: Severity, text: str) -> None:
         """Show a line at the ground station. Cut at 200 characters; of more than 16 waiting parts the oldest

@@ -251,6 +251,7 @@ class LinkProtocol:
         for timer in (self._version_timer, self._origin_timer, self._home_timer):
             timer.restart()
         self.parameters.restart()
+        self.source_set.settle(accepted=False, answer=None)
         self._census.restart()
 
     def _on_timesync(self, m: MavlinkMessage, arrival_ns: int) -> None:
@@ -281,10 +282,14 @@ class LinkProtocol:
         self.monitor.heard(text)
 
     def _on_command_ack(self, m: MavlinkMessage, arrival_ns: int) -> None:
+        # Zeros: for whoever asked, from firmware that does not say whom it answers.
+        if m.target_system not in (0, self.own_system_id) or m.target_component not in (0, self._options.component_id):
+            self.counts["acks_for_others"] += 1
+            return
         if m.command == dialect.MAV_CMD_SET_EKF_SOURCE_SET and m.result != dialect.MAV_RESULT_IN_PROGRESS:
-            number = self.source_set.answered()
-            if number is not None and m.result != dialect.MAV_RESULT_ACCEPTED:
-                logger.warning("autopilot refuses to take EKF source set %d (result %d)", number, m.result)
+            outcome = self.source_set.settle(accepted=m.result == dialect.MAV_RESULT_ACCEPTED, answer=m.result)
+            if outcome is not None and not outcome.accepted:
+                logger.warning("autopilot refuses to take EKF source set %d (result %d)", outcome.number, m.result)
         if m.result not in (dialect.MAV_RESULT_ACCEPTED, dialect.MAV_RESULT_IN_PROGRESS):
             self.counts["commands_refused"] += 1
 
@@ -316,6 +321,8 @@ class LinkProtocol:
                 self._silent = True
                 self.counts["silences"] += 1
                 logger.warning("autopilot silent: no heartbeat for %d s", _SILENT_AFTER_NS // _S)
+            # A switch is of the moment: not one that is said to an autopilot that comes back.
+            self.source_set.settle(accepted=False, answer=None)
             # Nothing is asked of a mute peer; its answers to a backlog of requests would come in one burst.
             return out
         ts1 = self.timesync.due(now_ns)
