@@ -163,7 +163,7 @@ class Daemon:
             fixed = config.mount.body_from_camera() if gimbal is None else None
             tracker = Tracker(self._georeference, fixed, config.tracker, first_reset_counter, config.witness)
             self._navigator = Navigator(localizer, tracker, config.timing.budget_ms)
-            self._link = AutopilotLink(config.link, self._clock, gimbal)
+            self._link = AutopilotLink(config.link, self._clock, gimbal, config.timing.max_age_ms)
             self._bus = resources.enter_context(closing(Bus(config.bus))) if config.bus.enabled else None
             self._recorder = (
                 resources.enter_context(closing(Recorder(Path(config.log.folder), config.log.max_mb)))

@@ -1076,12 +1076,12 @@ def test_latest_estimate_wins_on_a_choked_line():
         n = 0
         while link.statistics()["estimates_dropped"] < 200 and time.monotonic() < deadline:
             n += 1
-            link.send_estimate(estimate(n * 1000, north=float(n)))
+            link.send_estimate(estimate(time.monotonic_ns(), north=float(n)))
             time.sleep(0.001)
         assert link.statistics()["estimates_dropped"] >= 200 and link.connected()
         assert link.is_alive()
         assert link._transport.pending()
-        last = estimate((n + 1) * 1000, north=float(n + 1))
+        last = estimate(time.monotonic_ns(), north=float(n + 1))
         link.send_estimate(last)
         # Long enough for the thread to take it, were it to queue behind what waits.
         time.sleep(0.1)
@@ -1092,7 +1092,7 @@ def test_latest_estimate_wins_on_a_choked_line():
                 for m in parser.feed(wire.read(), time.monotonic_ns()):
                     if m.get_type() == "ODOMETRY":
                         stamps.append(m.time_usec)
-            return stamps and stamps[-1] == n + 1
+            return stamps and stamps[-1] == last.stamp_ns // 1000
 
         wait_for(drained, 0.4 + (deadline - time.monotonic() if deadline > time.monotonic() else 0))
         assert stamps == sorted(set(stamps)) and len(stamps) < n

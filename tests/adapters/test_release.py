@@ -229,6 +229,24 @@ def test_raw_is_each_fix_once_as_it_is(options):
     assert {o.estimate.covariance[0, 0] for _, o in out} == {0.25}
 
 
+@pytest.mark.parametrize("mode", ["raw", "fixed-latency", "fast-forward"])
+def test_what_waited_for_the_line_too_long_is_dropped(mode):
+    flight = Flight()
+    release = make(release=mode)
+    release.take(flight.fix(S), S + 100 * MS, flight.look)
+    assert release.due(9 * S, flight.look) is None and release.counts["too_old"] == 1
+    assert release.next_ns() is None
+    release.take(flight.fix(9 * S), 9 * S + 100 * MS, flight.look)
+    assert release.due(9 * S + 990 * MS, flight.look) is not None
+
+
+def test_a_fix_held_to_the_longest_age_is_not_too_old():
+    flight = Flight()
+    release = make(release="fixed-latency", fixed_latency_ms=1000.0)
+    release.take(flight.fix(3 * S), 3 * S + 300 * MS, flight.look)
+    assert release.due(4 * S + 60 * MS, flight.look) is not None
+
+
 def test_newer_replaces_what_was_not_sent():
     flight = Flight()
     release = make(release="raw")

@@ -26,6 +26,7 @@ from ortholoc_edge.adapters.mavlink.monitor import FusionReport
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus, parse_endpoint
 from ortholoc_edge.adapters.mavlink.parameters import Number, Reading, Written
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol, Statistic
+from ortholoc_edge.adapters.mavlink.release import MAX_AGE_MS
 from ortholoc_edge.adapters.mavlink.signing import ACCEPTED, STORE_INTERVAL_S, Verdict, make_signing
 from ortholoc_edge.adapters.mavlink.sinks import Sink
 from ortholoc_edge.adapters.mavlink.sources import Outcome
@@ -77,10 +78,17 @@ class AutopilotLink:
     again it ends, and :attr:`failure` says why; the daemon should then end too.
     """
 
-    def __init__(self, options: LinkOptions, clock: Clock, gimbal: GimbalSelection | None = None) -> None:
+    def __init__(
+        self,
+        options: LinkOptions,
+        clock: Clock,
+        gimbal: GimbalSelection | None = None,
+        max_age_ms: float = MAX_AGE_MS,
+    ) -> None:
         """
         Args:
             gimbal: the one that carries the camera; None: a fixed mount.
+            max_age_ms: a fix that is older when the line has room for it is dropped and counted.
         Raises: ConfigError if the endpoint can't be understood, a serial line can't carry what is asked of it, or the
             signing key can't be used.
         """
@@ -88,7 +96,7 @@ class AutopilotLink:
         self._plan = plan_line(options, self._endpoint, has_gimbal=gimbal is not None)
         self._plan.require_fit()
         self._options, self._clock = options, clock
-        self._protocol = LinkProtocol(options, gimbal)
+        self._protocol = LinkProtocol(options, gimbal, max_age_ms)
         self._mav = dialect.MAVLink(None, 0, options.component_id)
         self._signing = make_signing(options, os.environ)
         if self._signing is not None:
@@ -534,8 +542,9 @@ class AutopilotLink:
         with self._lock:
             messages = self._protocol.poll(now_ns)
             # While bytes wait, an estimate stays where a newer one can still replace it.
-            look = self._protocol.state_at
-            outgoing = None if transport.pending() else self._protocol.release.due(now_ns, look)
+            too_old = self._protocol.release.counts["too_old"]
+            outgoing = None if transport.pending() else self._protocol.due_estimate(now_ns)
+            self._counts["estimates_dropped"] += self._protocol.release.counts["too_old"] - too_old
             if outgoing is not None:
                 encoded = []
                 if self._protocol.connected(now_ns):

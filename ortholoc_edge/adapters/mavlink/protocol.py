@@ -18,7 +18,7 @@ from ortholoc_edge.adapters.mavlink.monitor import FusionMonitor, FusionReport
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus
 from ortholoc_edge.adapters.mavlink.outlet import Outlet
 from ortholoc_edge.adapters.mavlink.parameters import ParameterClient
-from ortholoc_edge.adapters.mavlink.release import Outgoing, Release
+from ortholoc_edge.adapters.mavlink.release import MAX_AGE_MS, Outgoing, Release
 from ortholoc_edge.adapters.mavlink.sinks import Sink
 from ortholoc_edge.adapters.mavlink.sources import PendingSwitch
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity, AutopilotState
@@ -55,7 +55,10 @@ class LinkProtocol:
     and sends what both return, in order.
     """
 
-    def __init__(self, options: LinkOptions, gimbal: GimbalSelection | None = None) -> None:
+    def __init__(
+        self, options: LinkOptions, gimbal: GimbalSelection | None = None, max_age_ms: float = MAX_AGE_MS
+    ) -> None:
+        """Args: as of :class:`AutopilotLink`."""
         self._options = options
         self._log = LimitedLog()
         self.system_status = SystemStatus.BOOT
@@ -67,7 +70,7 @@ class LinkProtocol:
         self.telemetry = Telemetry(
             self.timesync, self.counts, options.attitude_rate_hz, options.position_rate_hz, gimbal
         )
-        self.release = Release(options)
+        self.release = Release(options, max_age_ms)
         self.latency = LatencyMeter()
         self.monitor = FusionMonitor()
         self.source_set = PendingSwitch()
@@ -364,6 +367,14 @@ class LinkProtocol:
             self._tell_delays()
         number = self.source_set.due(now_ns)
         return [] if number is None else [self._command(dialect.MAV_CMD_SET_EKF_SOURCE_SET, number)]
+
+    def due_estimate(self, now_ns: int) -> Outgoing | None:
+        """The estimate to send now, if any."""
+        before = self.release.counts["too_old"]
+        outgoing = self.release.due(now_ns, self.state_at)
+        if self.release.counts["too_old"] != before:
+            self._log(now_ns, logging.WARNING, "too_old", "a fix that waited for the line too long is not sent any more")
+        return outgoing
 
     def sent(self, outgoing: Outgoing, now_ns: int) -> None:
         """An estimate was handed to the line."""
