@@ -453,8 +453,8 @@ class Daemon:
         systemd.notify(f"STATUS={status}, {self._counts['fixes']} fixes, {self._counts['rejected']} rejected")
         if self._link.connected():
             self._report_damage()
-            self._report_autopilot(now_ns)
             self._report_audit(now_ns)
+        self._report_autopilot(now_ns)
         if self._origin_missing and self._link.connected():
             self._link.send_status_text(Severity.WARNING, "OrthoLoC: EKF origin unknown, fixes not sent")
             self._origin_missing = False

@@ -23,6 +23,7 @@ from ortholoc_edge.adapters.mavlink.codec import FrameParser
 from ortholoc_edge.adapters.mavlink.estimates import Autopilot, VisionEstimate
 from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin, Place
 from ortholoc_edge.adapters.mavlink.history import TimeHistory
+from ortholoc_edge.adapters.mavlink.monitor import Fusion, FusionReport
 from ortholoc_edge.adapters.mavlink.options import parse_endpoint
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol
 from ortholoc_edge.adapters.mavlink.sources import Outcome
@@ -644,10 +645,12 @@ def test_silent_autopilot_is_left_alone_and_none_takes_its_place():
     script = Script()
     script.run(2.0)
     script.said.clear()
+    script.protocol.monitor._report = FusionReport(Fusion.FUSED, script.now, "its position follows the fixes")
     for _ in range(500):
         script.now += 20 * MS
         script.said += script.protocol.poll(script.now)
     assert not script.protocol.connected(script.now)
+    assert script.protocol.statistics(script.now)["fusion"] == "unknown"
     assert {m.get_type() for m in script.said[300:]} <= {"HEARTBEAT"}
     # Its neighbour's attitude would be worse than none; a swap on the bench takes a restart of ours.
     script.now += 2 * S

@@ -28,6 +28,7 @@ from adapters.hovering import PITCH, PLACE, ROLL, TRUE_NED, TRUTH, YAW, Hovering
 from replay import rendered
 
 from ortholoc_edge.adapters import systemd
+from ortholoc_edge.adapters.bus import AutopilotRecord
 from ortholoc_edge.adapters.camera import CameraOptions, EndOfFrames
 from ortholoc_edge.config import Config, LogOptions, MountOptions
 from ortholoc_edge.daemon import Daemon, LatestSlot
@@ -323,6 +324,36 @@ def test_spoofed_gnss_is_told_and_the_source_switched_where_enabled(folder: Path
                      f"a word about it, not {texts}")  # fmt: skip
             assert daemon.statistics()["fixes"] > 0
             assert set(autopilot.source_sets) == {3}
+    finally:
+        autopilot.close()
+
+
+class _Bus:
+    """Keeps what is published of the autopilot."""
+
+    dropped = 0
+
+    def __init__(self) -> None:
+        self.records: list[AutopilotRecord] = []
+
+    def publish(self, outcome: Outcome) -> None:
+        pass
+
+    def publish_autopilot(self, record: AutopilotRecord) -> None:
+        self.records.append(record)
+
+
+def test_a_lost_link_is_published(folder: Path) -> None:
+    wire = UdpWire()
+    autopilot = HoveringAutopilot(wire)
+    daemon = Daemon(config(f"folder:{folder}", f"udpout:127.0.0.1:{wire.port}"))
+    bus = daemon._bus = _Bus()  # type: ignore[assignment]
+    try:
+        with running(daemon):
+            wait_for(lambda: any(record.connected for record in bus.records), "a record of the autopilot")
+            autopilot.mute = True
+            wait_for(lambda: bus.records and not bus.records[-1].connected, "a record that it is lost")
+            assert bus.records[-1].fusion == "unknown"
     finally:
         autopilot.close()
 

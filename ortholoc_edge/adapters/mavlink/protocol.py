@@ -326,6 +326,8 @@ class LinkProtocol:
                 logger.warning("autopilot silent: no heartbeat for %d s", _SILENT_AFTER_NS // _S)
             # A switch is of the moment: not one that is said to an autopilot that comes back.
             self.source_set.settle(accepted=False, answer=None)
+            if self._monitor_timer.due(now_ns):
+                self.monitor.silent(now_ns)
             # Nothing is asked of a mute peer; its answers to a backlog of requests would come in one burst.
             return out
         ts1 = self.timesync.due(now_ns)
