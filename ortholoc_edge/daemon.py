@@ -187,7 +187,6 @@ class Daemon:
         self._damage_reported = 0
         self._origin: GeodeticOrigin | None = None
         self._restarts = 0
-        self._recovering = False
         self._last_status_ns = 0
         self._herald = Herald()
         self._sources = SourceSwitch(config.link)
@@ -318,10 +317,8 @@ class Daemon:
             self._feed_watchdog()
             return self._age_ms(frame.stamp_ns) < self._config.timing.max_age_ms and not stop.is_set()
 
-        searching = self._navigator.tracker.status is TrackerStatus.SEARCH
         outcome = self._navigator.step(frame, state, proceed)
         if isinstance(outcome, Fix):
-            self._recovering |= searching
             self._last_fix_ns = frame.stamp_ns
             age_ms, limit_ms = self._age_ms(frame.stamp_ns), self._config.timing.max_age_ms
             if age_ms > limit_ms:
@@ -421,8 +418,7 @@ class Daemon:
             self._navigator.tracker.reset_counter,
             mount.sigma_rad,
         )
-        self._link.send_estimate(estimate, recovery=self._recovering)
-        self._recovering = False
+        self._link.send_estimate(estimate)
 
     def _offer_origin(self, position_map: FloatArray) -> None:
         place = self._georeference.geodetic_from_map(position_map)

@@ -26,6 +26,7 @@ from ortholoc_edge.adapters.mavlink.history import TimeHistory
 from ortholoc_edge.adapters.mavlink.monitor import Fusion, FusionReport
 from ortholoc_edge.adapters.mavlink.options import parse_endpoint
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol
+from ortholoc_edge.adapters.mavlink.release import Outgoing
 from ortholoc_edge.adapters.mavlink.sources import Outcome
 from ortholoc_edge.adapters.mavlink.timesync import TimeSync
 from ortholoc_edge.clock import SystemClock
@@ -929,6 +930,15 @@ def test_fast_forward_over_a_real_wire(kind):
         assert statistics["release.carried"] == 1 and statistics["release.repeated"] == len(sent) - 1
         assert statistics["latency_median_ms"] >= 300.0
         assert "VISO_DELAY_MS" in statistics["delay_advice"]
+
+
+def test_an_outage_is_a_second_without_an_estimate_and_not_the_start():
+    protocol = LinkProtocol(LinkOptions(endpoint="udp:x:1"))
+    assert not protocol.is_outage(100 * S)
+    protocol.sent(Outgoing(estimate(100 * S), 100 * S, 0), 100 * S)
+    assert not protocol.is_outage(101 * S) and protocol.is_outage(101 * S + 1)
+    protocol.sent(Outgoing(estimate(102 * S), 102 * S, 0), 102 * S)
+    assert not protocol.is_outage(102 * S), "once"
 
 
 def test_source_set_is_commanded_until_acknowledged(caplog):

@@ -29,7 +29,8 @@ from replay import rendered
 
 from ortholoc_edge.adapters import systemd
 from ortholoc_edge.adapters.bus import AutopilotRecord
-from ortholoc_edge.adapters.camera import CameraOptions, EndOfFrames
+from ortholoc_edge.adapters.camera import CameraOptions, EndOfFrames, FrameSource, open_source
+from ortholoc_edge.clock import SystemClock
 from ortholoc_edge.config import Config, LogOptions, MountOptions
 from ortholoc_edge.daemon import Daemon, LatestSlot
 from ortholoc_edge.errors import MapError, OrtholocError
@@ -402,20 +403,44 @@ def test_a_place_needs_no_origin_and_does_not_jump_with_it(folder: Path) -> None
     assert autopilot.messages("ODOMETRY") == []
 
 
-def test_recovery_is_told_once(folder: Path) -> None:
+class _Covered:
+    """The folder's camera, with a lid."""
+
+    def __init__(self, frames: FrameSource) -> None:
+        self._frames = frames
+        self.is_covered = False
+
+    def read(self, timeout_s: float) -> Frame | None:
+        frame = self._frames.read(timeout_s)
+        return None if self.is_covered else frame
+
+    def close(self) -> None:
+        self._frames.close()
+
+
+def test_recovery_is_told_once_for_each_outage_and_not_at_the_start(folder: Path) -> None:
     wire = UdpWire()
     autopilot = HoveringAutopilot(wire)
-    daemon = Daemon(automatic(folder, wire, recovery=True))
+    settings = automatic(folder, wire, recovery=True)
+    camera = _Covered(open_source(settings.camera, SystemClock()))
+    daemon = Daemon(settings, frames=camera)
     try:
         with running(daemon):
-            wait_for(lambda: len(autopilot.messages("ODOMETRY")) >= 4, "four ODOMETRY")
+            wait_for(lambda: len(autopilot.messages("ODOMETRY")) >= 2, "two ODOMETRY")
+            camera.is_covered = True
+            wait_for(lambda: not daemon.link.estimate_sent_since(time.monotonic_ns() - 1_500_000_000), "an outage")
+            before = len(autopilot.messages("ODOMETRY"))
+            camera.is_covered = False
+            wait_for(lambda: len(autopilot.messages("ODOMETRY")) >= before + 2, "two more")
     finally:
         autopilot.close()
-    (command,) = autopilot.messages("COMMAND_INT")
+    kinds = [m.get_type() for m in autopilot.got if m.get_type() in ("COMMAND_INT", "ODOMETRY")]
+    commands = [place for place, kind in enumerate(kinds) if kind == "COMMAND_INT"]
+    # Besides ours, whatever pause this machine made of its own is one.
+    assert before in commands and kinds[0] == "ODOMETRY" and kinds[before + 1] == "ODOMETRY"
+    command = autopilot.messages("COMMAND_INT")[-1]
     assert command.command == dialect.MAV_CMD_EXTERNAL_POSITION_ESTIMATE
     assert command.x == pytest.approx(PLACE.lat_deg * 1e7, abs=300)
-    kinds = [m.get_type() for m in autopilot.got if m.get_type() in ("COMMAND_INT", "ODOMETRY")]
-    assert kinds[:2] == ["COMMAND_INT", "ODOMETRY"]
 
 
 def test_watchdog_starves_when_the_camera_hangs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

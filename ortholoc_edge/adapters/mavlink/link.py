@@ -107,7 +107,6 @@ class AutopilotLink:
         self._thread: threading.Thread | None = None
         self._transport: Transport | None = None
         self._wake_pair: tuple[socket.socket, socket.socket] | None = None
-        self._recovery = False
         self._texts: deque[MavlinkMessage] = deque(maxlen=16)
         self._text_id = 0
         self._log = LimitedLog()
@@ -210,19 +209,15 @@ class AutopilotLink:
         with self._lock:
             return self._protocol.sinks
 
-    def send_estimate(self, estimate: VisionEstimate, recovery: bool = False) -> None:
+    def send_estimate(self, estimate: VisionEstimate) -> None:
         """Hand a fix over; when and how often it goes out is ``options.release``'s. One that was not sent yet is
         replaced and counted: newer is better.
-
-        Args:
-            recovery: the first one after an outage; told as such with the next that is sent, if
-                ``options.recovery`` allows it.
+        The first one after an outage (`LinkProtocol.is_outage`) is told as such, if ``options.recovery`` allows it.
         """
         with self._lock:
             self._counts["estimates_dropped"] += self._protocol.release.take(
                 estimate, self._clock.now_ns(), self._protocol.state_at
             )
-            self._recovery |= recovery
         self._wake()
 
     def estimate_sent_since(self, since_ns: int) -> bool:
@@ -549,7 +544,8 @@ class AutopilotLink:
                 encoded = []
                 if self._protocol.connected(now_ns):
                     wall_ns = wall_clock_ns()
-                    encoded = self._protocol.encode_estimate(outgoing.estimate, now_ns, wall_ns, self._recovery)
+                    is_outage = self._protocol.is_outage(now_ns)
+                    encoded = self._protocol.encode_estimate(outgoing.estimate, now_ns, wall_ns, is_outage)
                 if not encoded:
                     self._counts["estimates_dropped"] += 1
             else:
@@ -561,7 +557,6 @@ class AutopilotLink:
         is_out = any(ok and m.get_type() in _CARRY_ESTIMATES for m, ok in zip(encoded, went_out, strict=True))
         if outgoing is not None and is_out:
             with self._lock:
-                self._recovery = False
                 self._protocol.sent(outgoing, now_ns)
         for message in messages:
             self._send(transport, message)

@@ -43,6 +43,9 @@ _AUTOPILOTS = {
 # An autopilot sends HEARTBEAT at 1 Hz; three missing is how ground stations judge it too.
 _SILENT_AFTER_NS = 3 * _S
 
+# ArduPilot sets its position by command only while its filter has fused none for a second.
+_OUTAGE_NS = 1 * _S
+
 
 def _repeat_at(rate_hz: float) -> Repeat | None:
     return Repeat(int(_S / rate_hz)) if rate_hz > 0 else None
@@ -375,8 +378,12 @@ class LinkProtocol:
         before = self.release.counts["too_old"]
         outgoing = self.release.due(now_ns, self.state_at)
         if self.release.counts["too_old"] != before:
-            self._log(now_ns, logging.WARNING, "too_old", "a fix that waited for the line too long is not sent any more")
+            self._log(now_ns, logging.WARNING, "too_old", "a fix that waited too long for the line is not sent")
         return outgoing
+
+    def is_outage(self, now_ns: int) -> bool:
+        """Whether estimates flowed and none left for so long that ArduPilot takes a new position by command."""
+        return self.last_sent_ns is not None and now_ns - self.last_sent_ns > _OUTAGE_NS
 
     def sent(self, outgoing: Outgoing, now_ns: int) -> None:
         """An estimate was handed to the line."""

@@ -118,7 +118,8 @@ class Release:
     def __init__(self, options: LinkOptions, max_age_ms: float = MAX_AGE_MS) -> None:
         """
         Args:
-            max_age_ms: a fix goes out for the first time no older than this; one held to an age, than that and a little.
+            max_age_ms: a fix goes out for the first time no older than this; where it is held to an age, no older
+                than that and a little.
         """
         self.believed = (math.inf, math.inf)
         self.mode = "raw" if options.estimate_rate_hz == 0.0 else options.release
