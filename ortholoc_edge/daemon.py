@@ -62,6 +62,8 @@ logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
+_S = 1_000_000_000
+
 _WAIT_S = 0.2
 # The autopilot's attitude for an exposure arrives after it; the frame waits this long for it at most.
 _STATE_WAIT_NS = 150_000_000
@@ -69,9 +71,10 @@ _MAX_ERRORS_IN_A_ROW = 5
 _STATUS_INTERVAL_NS = 1_000_000_000
 _FRESH_FIX_NS = 3_000_000_000
 _MOST_AUDIT_TEXTS = 3
+# A state that lasts is said when it begins, and again this long after.
+_TELL_AGAIN_NS = 30 * _S
 # A read returns within `_WAIT_S`; a driver that holds it this long is not coming back by itself.
 _CAPTURE_HUNG_NS = 5_000_000_000
-_S = 1_000_000_000
 
 OutcomeListener = Callable[[Frame | None, Outcome], None]
 
@@ -180,6 +183,7 @@ class Daemon:
         self._last_fix_ns: int | None = None
         self._counts: Counter[str] = Counter()
         self._origin_missing = False
+        self._origin_told_ns: int | None = None
         self._checkup: Checkup | None = Checkup(
             self._link, config.link, lever_arm_m=config.mount.lever_arm_m, ages=self._link.ages
         )
@@ -397,6 +401,8 @@ class Daemon:
             self._offer_origin(map_from_body.translation)
             if all(local):
                 return
+        if now.origin is not None:
+            self._origin_told_ns = None
         moved = any(local) and not (
             self._origin is None or now.origin is None or is_same_origin(now.origin, self._origin)
         )
@@ -452,8 +458,10 @@ class Daemon:
             self._report_audit(now_ns)
         self._report_autopilot(now_ns)
         if self._origin_missing and self._link.connected():
-            self._link.send_status_text(Severity.WARNING, "OrthoLoC: EKF origin unknown, fixes not sent")
             self._origin_missing = False
+            if self._origin_told_ns is None or now_ns - self._origin_told_ns >= _TELL_AGAIN_NS:
+                self._origin_told_ns = now_ns
+                self._link.send_status_text(Severity.WARNING, "OrthoLoC: EKF origin unknown, fixes not sent")
 
     def _report_autopilot(self, now_ns: int) -> None:
         """Say and publish what the autopilot does with the fixes and whether GNSS agrees with them; switch its source

@@ -158,12 +158,15 @@ def test_without_an_origin_nothing_is_sent(folder: Path) -> None:
             texts = wait_for(
                 lambda: [m.text for m in autopilot.messages("STATUSTEXT") if "origin" in m.text], "the warning"
             )
+            told = len(autopilot.messages("HEARTBEAT"))
+            wait_for(lambda: len(autopilot.messages("HEARTBEAT")) >= told + 3, "three seconds more")
+            texts = [m.text for m in autopilot.messages("STATUSTEXT") if "origin" in m.text]
     finally:
         autopilot.close()
     assert autopilot.messages("ODOMETRY") == []
     assert autopilot.messages("VISION_POSITION_ESTIMATE") == []
     assert autopilot.got_counts["SET_GPS_GLOBAL_ORIGIN"] == 0
-    assert "not sent" in texts[0]
+    assert len(texts) == 1 and "not sent" in texts[0]
 
 
 def test_wrong_settings_are_told_once(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
