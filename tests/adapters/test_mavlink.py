@@ -932,6 +932,15 @@ def test_fast_forward_over_a_real_wire(kind):
         assert "VISO_DELAY_MS" in statistics["delay_advice"]
 
 
+def test_what_a_filter_said_of_itself_expires():
+    script = Script()
+    script.hear(heartbeat())
+    script.hear(dialect.MAVLink_ekf_status_report_message(831, 0.0, 2.5, 0.0, 0.0, 0.0))
+    fresh, stale = (script.protocol.state_at(script.now + after) for after in (3 * S, 4 * S))
+    assert (fresh.estimator_flags, fresh.position_test_ratio) == (831, 2.5)
+    assert (stale.estimator_flags, stale.position_test_ratio) == (None, None)
+
+
 def test_an_outage_is_a_second_without_an_estimate_and_not_the_start():
     protocol = LinkProtocol(LinkOptions(endpoint="udp:x:1"))
     assert not protocol.is_outage(100 * S)
