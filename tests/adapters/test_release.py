@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import random
 from dataclasses import replace
 
 import numpy as np
@@ -63,6 +64,24 @@ def test_ten_a_second_whatever_the_fixes_do():
     release = make(estimate_rate_hz=20.0)
     assert set(np.diff([now for now, _ in fly(release, flight, 8 * S, regular(flight))])) == {50 * MS}
     assert release.counts["carried"] == 14
+
+
+def test_a_new_fix_goes_at_once_and_the_rate_stays():
+    """Fixes at any time: none waits for a raster, none comes too close, and there are ten a second as planned."""
+    flight, rng = Flight(), random.Random(0)
+    release, at, fixes = make(), S, {}
+    while at < 40 * S:
+        fixes[at] = flight.fix(at - 150 * MS)
+        at += rng.randrange(180, 320) * MS
+    out = fly(release, flight, 40 * S, fixes, start_ns=S, step_ns=MS)
+    first = {outgoing.capture_ns: now for now, outgoing in reversed(out)}
+    waits = [first[fix.stamp_ns] - ready for ready, fix in fixes.items()]
+    assert np.median(waits) == 0 and max(waits) <= 25 * MS
+    assert min(np.diff([now for now, _ in out])) >= 25 * MS
+    assert 9.0 * 39 < len(out) <= 10.0 * 39 + 2
+    # Faster fixes than may go out wait their turn.
+    fast = {S + i * 30 * MS: flight.fix(S + i * 30 * MS - 10 * MS) for i in range(300)}
+    assert len(fly(make(), flight, 10 * S, fast, start_ns=S, step_ns=MS)) <= 93
 
 
 def test_a_loop_that_fell_behind_sends_no_burst():

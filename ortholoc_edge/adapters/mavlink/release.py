@@ -63,6 +63,8 @@ _COMPARE_NS = 5 * _S
 # that is held to an age.
 MAX_AGE_MS = 1000.0
 _HELD_LATE_NS = 250 * _MS
+# ArduPilot drops what comes within 20 ms of the one before.
+_LEAST_GAP_NS = 25 * _MS
 # Held fixes: more than these are never under way, unless time stands still.
 _HELD = 16
 
@@ -132,7 +134,7 @@ class Release:
             self._max_age_ns = max(self._max_age_ns, self._latency_ns + _HELD_LATE_NS)
         self._held: deque[_Taken] = deque(maxlen=_HELD)
         self._fix: _Taken | None = None
-        self._next_ns = 0
+        self._next_ns = self._sent_ns = 0
         self._intervals_ns: deque[int] = deque(maxlen=5)
         self._newest: _Taken | None = None
         self._in_doubt = False
@@ -172,7 +174,7 @@ class Release:
             return self._held[0].estimate.stamp_ns + self._latency_ns if self._held else None
         if self._fix is None:
             return None
-        return 0 if self.mode == "raw" else self._next_ns
+        return 0 if self.mode == "raw" else self._turn_ns(self._fix)
 
     def due(self, now_ns: int, look: Look) -> Outgoing | None:
         """What is to be sent now, if anything."""
@@ -192,13 +194,20 @@ class Release:
             return _as_it_is(fix)
         return self._due_carried(fix, now_ns, look)
 
+    def _turn_ns(self, fix: _Taken) -> int:
+        """When the next estimate of a fix may go. A new fix goes at once and takes the turn that comes next, so that as
+        many go in a second as without it; but no two turns ahead, and not so close that ArduPilot drops it."""
+        if fix.released > 0:
+            return self._next_ns
+        return max(self._next_ns - self._period_ns, self._sent_ns + min(self._period_ns, _LEAST_GAP_NS))
+
     def _is_too_old(self, fix: _Taken, now_ns: int) -> bool:
         is_old = now_ns - fix.estimate.stamp_ns > self._max_age_ns
         self.counts["too_old"] += is_old
         return is_old
 
     def _due_carried(self, fix: _Taken, now_ns: int, look: Look) -> Outgoing | None:
-        if now_ns < self._next_ns:
+        if now_ns < self._turn_ns(fix):
             return None
         if now_ns - fix.arrival_ns > self._max_repeat_ns and fix.released > 0:
             self.counts["repeats_ended"] += 1
@@ -207,6 +216,7 @@ class Release:
         # On its raster, but not two at once where the loop fell behind: ArduPilot drops what comes within 20 ms.
         if now_ns - self._next_ns >= self._period_ns:
             self._next_ns = now_ns
+        self._sent_ns = now_ns
         self._next_ns += self._period_ns
         if self._next_ns - now_ns < self._period_ns // 2:
             self._next_ns += self._period_ns
