@@ -153,6 +153,26 @@ def test_half_open_tcp_connection_is_given_up(monkeypatch):
         wait_for(lambda: wire.accepted >= 2 and good_state(link))
 
 
+def test_a_defect_in_one_message_costs_that_message_only(monkeypatch, caplog):
+    wire = UdpWire()
+    autopilot = FakeAutopilot(wire)
+    link = AutopilotLink(LinkOptions(endpoint=f"udpout:127.0.0.1:{wire.port}"), SystemClock())
+    monkeypatch.setitem(link._protocol._handlers, "HOME_POSITION", lambda m, arrival_ns: 1 // 0)
+    try:
+        with link:
+            wait_for(link.connected)
+            bad = dialect.MAVLink_home_position_message(0, 0, 0, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0)
+            good = dialect.MAVLink_statustext_message(6, b"all is well")
+            mav = dialect.MAVLink(None, 7, 1)
+            for _ in range(3):
+                wire.write(bytes(bad.pack(mav)) + bytes(good.pack(mav)))  # in one datagram
+            wait_for(lambda: link.statistics().get("received.STATUSTEXT", 0) >= 3)
+            assert link.statistics()["internal_errors"] >= 3 and link.is_alive()
+    finally:
+        autopilot.close()
+    assert caplog.text.count("ZeroDivisionError") == 1, "one traceback in ten seconds"
+
+
 def test_a_flood_of_datagrams_leaves_time_to_speak():
     """Between two chances to speak no more is taken in than some milliseconds of work; what waits is not lost."""
     transport = open_transport(parse_endpoint(f"udp:127.0.0.1:{(port := free_udp_port())}"))

@@ -8,6 +8,7 @@ import os
 import select
 import socket
 import threading
+import traceback
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping
 from types import TracebackType
@@ -463,20 +464,25 @@ class AutopilotLink:
                 and now_ns - last_heard_ns > _TCP_SILENCE_NS
             ):
                 raise ConnectionError(f"nothing came for {_TCP_SILENCE_NS // _S} s")
+            errors: list[Exception] = []
+            for data, peer in arrived:
+                errors += self._take(transport, data, peer, now_ns)
             try:
-                for data, peer in arrived:
-                    self._take(transport, data, peer, now_ns)
                 self._say(transport)
-                errors_in_a_row = 0
             except OSError:
                 raise
-            except Exception:
-                # A defect of ours must not take attitude and estimates from the vehicle; unless it stays.
-                self._counts["internal_errors"] += 1
-                errors_in_a_row += 1
-                if errors_in_a_row >= _GIVE_UP_AFTER_ERRORS:
-                    raise
-                logger.exception("autopilot link: one item was left out")
+            except Exception as error:
+                errors.append(self._left_out(error))
+            # A defect of ours must not take attitude and estimates from the vehicle; unless it stays.
+            errors_in_a_row = errors_in_a_row + 1 if errors else 0
+            if errors_in_a_row >= _GIVE_UP_AFTER_ERRORS:
+                raise errors[-1]
+
+    def _left_out(self, error: Exception) -> Exception:
+        self._counts["internal_errors"] += 1
+        told = "".join(traceback.format_exception(error))
+        self._log(self._clock.now_ns(), logging.ERROR, "internal", f"autopilot link: one item was left out\n{told}")
+        return error
 
     def _wait_s(self) -> float:
         """Until something is due, and never long."""
@@ -488,7 +494,8 @@ class AutopilotLink:
         # What was due before waits for the line, which select tells of; a loop without a pause would not help it.
         return _SELECT_TIMEOUT_S if left_s <= 0.0 else min(left_s, _SELECT_TIMEOUT_S)
 
-    def _take(self, transport: Transport, data: bytes, peer: Any, now_ns: int) -> None:
+    def _take(self, transport: Transport, data: bytes, peer: Any, now_ns: int) -> list[Exception]:
+        """Take in what arrived; returns the errors of ours that single messages met with."""
         with self._lock:
             parser = self._parsers.get(peer)
             if parser is None:
@@ -496,21 +503,31 @@ class AutopilotLink:
                 if len(self._parsers) >= 8:
                     self._retire(self._parsers.pop(next(iter(self._parsers))))
                 parser = self._parsers[peer] = FrameParser(lambda message: self._accepts(transport, message, peer))
+        errors = []
         for message in parser.feed(data, now_ns):
-            self._counts["messages"] += 1
-            self._counts[f"received_bytes.{message.get_type()}"] += len(message.get_msgbuf())
-            with self._lock:
-                answers = self._protocol.on_message(message, now_ns)
-                vehicle = self._protocol.vehicle
-            # Replies go where our autopilot is. Until it was heard, to whoever speaks MAVLink.
-            ours = vehicle is not None and message.get_srcSystem() == vehicle.system_id
-            if ours and self._protocol.is_vehicle_heartbeat(message):
-                transport.prefer(peer)
-                self._peer_is_vehicle = True
-            elif not self._peer_is_vehicle:
-                transport.prefer(peer)
-            for answer in answers:
-                self._send(transport, answer)
+            try:
+                self._take_message(transport, message, peer, now_ns)
+            except OSError:
+                raise
+            except Exception as error:
+                errors.append(self._left_out(error))
+        return errors
+
+    def _take_message(self, transport: Transport, message: MavlinkMessage, peer: Any, now_ns: int) -> None:
+        self._counts["messages"] += 1
+        self._counts[f"received_bytes.{message.get_type()}"] += len(message.get_msgbuf())
+        with self._lock:
+            answers = self._protocol.on_message(message, now_ns)
+            vehicle = self._protocol.vehicle
+        # Replies go where our autopilot is. Until it was heard, to whoever speaks MAVLink.
+        ours = vehicle is not None and message.get_srcSystem() == vehicle.system_id
+        if ours and self._protocol.is_vehicle_heartbeat(message):
+            transport.prefer(peer)
+            self._peer_is_vehicle = True
+        elif not self._peer_is_vehicle:
+            transport.prefer(peer)
+        for answer in answers:
+            self._send(transport, answer)
 
     def _accepts(self, transport: Transport, message: MavlinkMessage, peer: Any) -> bool:
         """Whether a frame's signature lets it count."""
