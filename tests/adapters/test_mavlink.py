@@ -932,6 +932,17 @@ def test_fast_forward_over_a_real_wire(kind):
         assert "VISO_DELAY_MS" in statistics["delay_advice"]
 
 
+def test_no_text_of_the_autopilot_hides_another(caplog):
+    caplog.set_level("INFO")
+    script = Script()
+    script.hear(heartbeat())
+    for _ in range(2):
+        for n in range(200):
+            script.hear(dialect.MAVLink_statustext_message(6, f"text {n}.".encode()))
+    assert all(caplog.text.count(f"text {n}.") == 1 for n in range(200))
+    assert script.protocol.counts["texts_repeated"] == 200
+
+
 def test_what_a_filter_said_of_itself_expires():
     script = Script()
     script.hear(heartbeat())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections import Counter
+from collections import Counter, OrderedDict
 from collections.abc import Callable
 
 from ortholoc_edge.adapters.computer import ComputerStatus
@@ -43,6 +43,9 @@ _AUTOPILOTS = {
 # An autopilot sends HEARTBEAT at 1 Hz; three missing is how ground stations judge it too.
 _SILENT_AFTER_NS = 3 * _S
 
+# The same text is logged once in this time; of this many texts it is known when that was.
+_TEXT_AGAIN_NS = 10 * _S
+_MOST_TEXTS = 256
 # ArduPilot sets its position by command only while its filter has fused none for a second.
 _OUTAGE_NS = 1 * _S
 
@@ -77,6 +80,7 @@ class LinkProtocol:
         self.latency = LatencyMeter()
         self.monitor = FusionMonitor()
         self.source_set = PendingSwitch()
+        self._texts_told: OrderedDict[str, int] = OrderedDict()
         self._advice: DelayAdvice | None = None
         self.parameters = ParameterClient()
         self._census = Census()
@@ -284,7 +288,15 @@ class LinkProtocol:
         level = logging.WARNING if m.severity <= Severity.ERROR else logging.INFO
         # Printable only: what comes over a radio must not steer a terminal.
         text = "".join(c if c.isprintable() else "?" for c in str(m.text))
-        self._log(arrival_ns, level, f"text.{hash(text) % 64}", f"autopilot says: {text}")
+        # By the text itself: one that repeats must not hide another.
+        if text in self._texts_told and arrival_ns - self._texts_told[text] < _TEXT_AGAIN_NS:
+            self.counts["texts_repeated"] += 1
+        else:
+            self._texts_told[text] = arrival_ns
+            self._texts_told.move_to_end(text)
+            if len(self._texts_told) > _MOST_TEXTS:
+                self._texts_told.popitem(last=False)
+            logger.log(level, "autopilot says: %s", text)
         self.monitor.heard(text)
 
     def _on_command_ack(self, m: MavlinkMessage, arrival_ns: int) -> None:
