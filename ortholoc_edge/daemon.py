@@ -36,7 +36,7 @@ from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate
 from ortholoc_edge.adapters.mavlink.geodesy import EarthModel, GeodeticOrigin, Place, is_same_origin, ned_from_geodetic
 from ortholoc_edge.adapters.mavlink.herald import Herald
 from ortholoc_edge.adapters.mavlink.sinks import earth_model
-from ortholoc_edge.adapters.mavlink.sources import SourceSwitch
+from ortholoc_edge.adapters.mavlink.sources import SourceSwitch, Withheld
 from ortholoc_edge.adapters.recorder import Recorder
 from ortholoc_edge.clock import Clock, SystemClock
 from ortholoc_edge.config import Config
@@ -52,7 +52,7 @@ from ortholoc_edge.pipeline.localizer import Localizer
 from ortholoc_edge.pipeline.navigator import Navigator
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.tracker import Tracker, TrackerStatus
-from ortholoc_edge.pipeline.witness import WitnessReport
+from ortholoc_edge.pipeline.witness import Consistency, WitnessReport
 from ortholoc_edge.pose import pnp
 from ortholoc_edge.tiles.georeference import Georeference
 from ortholoc_edge.tiles.pack import Pack
@@ -62,6 +62,8 @@ logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
+_S = 1_000_000_000
+
 _WAIT_S = 0.2
 # The autopilot's attitude for an exposure arrives after it; the frame waits this long for it at most.
 _STATE_WAIT_NS = 150_000_000
@@ -69,9 +71,10 @@ _MAX_ERRORS_IN_A_ROW = 5
 _STATUS_INTERVAL_NS = 1_000_000_000
 _FRESH_FIX_NS = 3_000_000_000
 _MOST_AUDIT_TEXTS = 3
+# A state that lasts is said when it begins, and again this long after.
+_TELL_AGAIN_NS = 30 * _S
 # A read returns within `_WAIT_S`; a driver that holds it this long is not coming back by itself.
 _CAPTURE_HUNG_NS = 5_000_000_000
-_S = 1_000_000_000
 
 OutcomeListener = Callable[[Frame | None, Outcome], None]
 
@@ -163,7 +166,7 @@ class Daemon:
             fixed = config.mount.body_from_camera() if gimbal is None else None
             tracker = Tracker(self._georeference, fixed, config.tracker, first_reset_counter, config.witness)
             self._navigator = Navigator(localizer, tracker, config.timing.budget_ms)
-            self._link = AutopilotLink(config.link, self._clock, gimbal)
+            self._link = AutopilotLink(config.link, self._clock, gimbal, config.timing.max_age_ms)
             self._bus = resources.enter_context(closing(Bus(config.bus))) if config.bus.enabled else None
             self._recorder = (
                 resources.enter_context(closing(Recorder(Path(config.log.folder), config.log.max_mb)))
@@ -180,6 +183,7 @@ class Daemon:
         self._last_fix_ns: int | None = None
         self._counts: Counter[str] = Counter()
         self._origin_missing = False
+        self._origin_told_ns: int | None = None
         self._checkup: Checkup | None = Checkup(
             self._link, config.link, lever_arm_m=config.mount.lever_arm_m, ages=self._link.ages
         )
@@ -187,7 +191,6 @@ class Daemon:
         self._damage_reported = 0
         self._origin: GeodeticOrigin | None = None
         self._restarts = 0
-        self._recovering = False
         self._last_status_ns = 0
         self._herald = Herald()
         self._sources = SourceSwitch(config.link)
@@ -318,10 +321,8 @@ class Daemon:
             self._feed_watchdog()
             return self._age_ms(frame.stamp_ns) < self._config.timing.max_age_ms and not stop.is_set()
 
-        searching = self._navigator.tracker.status is TrackerStatus.SEARCH
         outcome = self._navigator.step(frame, state, proceed)
         if isinstance(outcome, Fix):
-            self._recovering |= searching
             self._last_fix_ns = frame.stamp_ns
             age_ms, limit_ms = self._age_ms(frame.stamp_ns), self._config.timing.max_age_ms
             if age_ms > limit_ms:
@@ -400,6 +401,8 @@ class Daemon:
             self._offer_origin(map_from_body.translation)
             if all(local):
                 return
+        if now.origin is not None:
+            self._origin_told_ns = None
         moved = any(local) and not (
             self._origin is None or now.origin is None or is_same_origin(now.origin, self._origin)
         )
@@ -421,8 +424,7 @@ class Daemon:
             self._navigator.tracker.reset_counter,
             mount.sigma_rad,
         )
-        self._link.send_estimate(estimate, recovery=self._recovering)
-        self._recovering = False
+        self._link.send_estimate(estimate)
 
     def _offer_origin(self, position_map: FloatArray) -> None:
         place = self._georeference.geodetic_from_map(position_map)
@@ -453,29 +455,55 @@ class Daemon:
         systemd.notify(f"STATUS={status}, {self._counts['fixes']} fixes, {self._counts['rejected']} rejected")
         if self._link.connected():
             self._report_damage()
-            self._report_autopilot(now_ns, fresh)
             self._report_audit(now_ns)
+        self._report_autopilot(now_ns)
         if self._origin_missing and self._link.connected():
-            self._link.send_status_text(Severity.WARNING, "OrthoLoC: EKF origin unknown, fixes not sent")
             self._origin_missing = False
+            if self._origin_told_ns is None or now_ns - self._origin_told_ns >= _TELL_AGAIN_NS:
+                self._origin_told_ns = now_ns
+                self._link.send_status_text(Severity.WARNING, "OrthoLoC: EKF origin unknown, fixes not sent")
 
-    def _report_autopilot(self, now_ns: int, fixes_fresh: bool) -> None:
+    def _report_autopilot(self, now_ns: int) -> None:
         """Say and publish what the autopilot does with the fixes and whether GNSS agrees with them; switch its source
         if that was enabled."""
         fusion, witness = self._link.fusion, self._navigator.tracker.witness.report
         for severity, text in self._herald.tell(fusion, witness):
             logger.log(logging.INFO if severity >= Severity.NOTICE else logging.WARNING, "%s", text)
             self._link.send_status_text(severity, text)
-        vehicle = self._link.vehicle
-        autopilot = vehicle.autopilot if vehicle else None
-        switch = self._sources.decide(witness.state, fixes_fresh, autopilot, self._link.restarts, now_ns)
-        if switch is not None:
-            logger.warning("%s", switch.text)
-            self._counts[f"switched_to_{switch.source}"] += 1
-            self._link.take_source_set(switch.number)
-            self._link.send_status_text(Severity.WARNING, switch.text)
+        self._switch_sources(witness.state, now_ns)
         if self._bus is not None:
             self._bus.publish_autopilot(autopilot_record(now_ns, self._link, witness, self._sources.on_vision))
+
+    def _switch_sources(self, consistency: Consistency, now_ns: int) -> None:
+        """Command the autopilot's source set where that was enabled; announce what it took."""
+        outcome = self._link.source_set_outcome()
+        if outcome is not None:
+            taken = self._sources.settle(outcome, now_ns)
+            if taken is not None:
+                logger.warning("%s", taken.text)
+                self._counts[f"switched_to_{taken.source}"] += 1
+                self._link.send_status_text(Severity.WARNING, taken.text)
+            elif not outcome.accepted:
+                why = "no answer" if outcome.answer is None else f"result {outcome.answer}"
+                logger.warning("EKF source set %d was not taken (%s); tried again later", outcome.number, why)
+                self._counts["switches_not_taken"] += 1
+        vehicle, number = self._link.vehicle, self._config.link.vision_source_set
+        reading = self._link.parameters()[0].get(f"EK3_SRC{number}_POSXY")
+        switch = self._sources.decide(
+            consistency,
+            # Not what we know of where we are, but what the autopilot was told: a set without fixes is no position.
+            self._link.estimate_sent_since(now_ns - _FRESH_FIX_NS),
+            vehicle.autopilot if vehicle else None,
+            self._link.restarts,
+            now_ns,
+            vision_posxy=None if reading is None else reading.value,
+        )
+        if isinstance(switch, Withheld):
+            logger.warning("%s: set it, or [link] vision_source_set; GNSS is bad and stays in use", switch.text)
+            self._link.send_status_text(Severity.WARNING, switch.text)
+        elif switch is not None:
+            logger.warning("commanding EKF source set %d (%s)", switch.number, switch.source)
+            self._link.take_source_set(switch.number)
 
     def _report_audit(self, now_ns: int) -> None:
         """Say once what is wrong with the autopilot's settings; of its delays as soon as our latency is known."""

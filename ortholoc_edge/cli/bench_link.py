@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import logging
 import os
 import sys
@@ -20,7 +21,7 @@ from ortholoc_edge.cli.arguments import positive, positive_int, seed
 from ortholoc_edge.cli.measured import print_heading, provenance
 
 _LATENCIES: Final = (
-    "| wire | load | fix ready to bytes read, median / p99 / max ms "
+    "| wire | load | release | fix ready to bytes read, median / p99 / max ms "
     "| TIMESYNC question to answer, median / p99 / max ms | estimates / questions | localized per s | peer |"
 )
 _SOAK: Final = (
@@ -93,12 +94,12 @@ def _latencies(args: argparse.Namespace) -> None:
         print_heading(_LATENCIES)
     kinds: tuple[link.WireKind, ...] = ("pty", "udp")
     if "idle" in args.loads:
-        for kind in kinds:
-            _print_latencies(args, link.measure(kind, args.seconds, None, args.seed))
+        for kind, release in itertools.product(kinds, link.RELEASES):
+            _print_latencies(args, link.measure(kind, args.seconds, None, args.seed, release))
     if "localizing" in args.loads:
         with link.LocalizerLoad(args.pack or _demo_pack(), args.threads) as load:
-            for kind in kinds:
-                _print_latencies(args, link.measure(kind, args.seconds, load, args.seed))
+            for kind, release in itertools.product(kinds, link.RELEASES):
+                _print_latencies(args, link.measure(kind, args.seconds, load, args.seed, release))
 
 
 def _demo_pack() -> Path:
@@ -115,8 +116,8 @@ def _print_latencies(args: argparse.Namespace, found: Latencies) -> None:
         args,
         "latencies",
         found,
-        f"| {found.wire} | {load} | {_times(found.estimate)} | {_times(found.timesync)} | {found.estimate.count} / "
-        f"{found.timesync.count} | {found.load_fps:.1f} | {peer} |",
+        f"| {found.wire} | {load} | {found.release} | {_times(found.estimate)} | {_times(found.timesync)} | "
+        f"{found.estimate.count} / {found.timesync.count} | {found.load_fps:.1f} | {peer} |",
     )
 
 

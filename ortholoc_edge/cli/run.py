@@ -9,6 +9,7 @@ import threading
 from pathlib import Path
 
 from ortholoc_edge.adapters.mavlink.link import SWITCH_INTERVAL_S
+from ortholoc_edge.cli.logs import from_a_thread_of_its_own
 from ortholoc_edge.config import read_config
 from ortholoc_edge.daemon import Daemon
 
@@ -30,5 +31,6 @@ def run(args: argparse.Namespace) -> int:
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
-    daemon.run(stop)
+    with from_a_thread_of_its_own():
+        daemon.run(stop)
     return 0

@@ -49,6 +49,15 @@ def test_invented_identities_do_not_fill_the_memory():
     assert len(census.rates_hz(0)) == 256
 
 
+def test_a_flood_of_identities_hides_neither_the_autopilot_nor_who_came_last():
+    census = Census()
+    census.take(received(heartbeat(), 7, 1))
+    for system in range(1, 201):
+        census.take(received(heartbeat(8, 6), system, 190))
+    keys = {(peer.system_id, peer.component_id) for peer in census.peers}
+    assert len(keys) == 64 and (7, 1) in keys and (200, 190) in keys
+
+
 def test_mavlink_version_is_the_autopilots():
     census = Census()
     census.take(received(heartbeat(), mavlink1=True))

@@ -23,8 +23,11 @@ from ortholoc_edge.adapters.mavlink.codec import FrameParser
 from ortholoc_edge.adapters.mavlink.estimates import Autopilot, VisionEstimate
 from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin, Place
 from ortholoc_edge.adapters.mavlink.history import TimeHistory
+from ortholoc_edge.adapters.mavlink.monitor import Fusion, FusionReport
 from ortholoc_edge.adapters.mavlink.options import parse_endpoint
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol
+from ortholoc_edge.adapters.mavlink.release import Outgoing
+from ortholoc_edge.adapters.mavlink.sources import Outcome
 from ortholoc_edge.adapters.mavlink.timesync import TimeSync
 from ortholoc_edge.clock import SystemClock
 from ortholoc_edge.errors import ConfigError, LinkError
@@ -643,10 +646,12 @@ def test_silent_autopilot_is_left_alone_and_none_takes_its_place():
     script = Script()
     script.run(2.0)
     script.said.clear()
+    script.protocol.monitor._report = FusionReport(Fusion.FUSED, script.now, "its position follows the fixes")
     for _ in range(500):
         script.now += 20 * MS
         script.said += script.protocol.poll(script.now)
     assert not script.protocol.connected(script.now)
+    assert script.protocol.statistics(script.now)["fusion"] == "unknown"
     assert {m.get_type() for m in script.said[300:]} <= {"HEARTBEAT"}
     # Its neighbour's attitude would be worse than none; a swap on the bench takes a restart of ours.
     script.now += 2 * S
@@ -927,15 +932,51 @@ def test_fast_forward_over_a_real_wire(kind):
         assert "VISO_DELAY_MS" in statistics["delay_advice"]
 
 
+def test_no_text_of_the_autopilot_hides_another(caplog):
+    caplog.set_level("INFO")
+    script = Script()
+    script.hear(heartbeat())
+    for _ in range(2):
+        for n in range(200):
+            script.hear(dialect.MAVLink_statustext_message(6, f"text {n}.".encode()))
+    assert all(caplog.text.count(f"text {n}.") == 1 for n in range(200))
+    assert script.protocol.counts["texts_repeated"] == 200
+
+
+def test_what_a_filter_said_of_itself_expires():
+    script = Script()
+    script.hear(heartbeat())
+    script.hear(dialect.MAVLink_ekf_status_report_message(831, 0.0, 2.5, 0.0, 0.0, 0.0))
+    fresh, stale = (script.protocol.state_at(script.now + after) for after in (3 * S, 4 * S))
+    assert (fresh.estimator_flags, fresh.position_test_ratio) == (831, 2.5)
+    assert (stale.estimator_flags, stale.position_test_ratio) == (None, None)
+
+
+def test_an_outage_is_a_second_without_an_estimate_and_not_the_start():
+    protocol = LinkProtocol(LinkOptions(endpoint="udp:x:1"))
+    assert not protocol.is_outage(100 * S)
+    protocol.sent(Outgoing(estimate(100 * S), 100 * S, 0), 100 * S)
+    assert not protocol.is_outage(101 * S) and protocol.is_outage(101 * S + 1)
+    protocol.sent(Outgoing(estimate(102 * S), 102 * S, 0), 102 * S)
+    assert not protocol.is_outage(102 * S), "once"
+
+
 def test_source_set_is_commanded_until_acknowledged(caplog):
     script = Script()
     script.hear(heartbeat())
     script.protocol.source_set.ask(2)
     script.run(2.5)
     assert script.commands(42007) == [2, 2, 2]
-    script.hear(dialect.MAVLink_command_ack_message(42007, dialect.MAV_RESULT_DENIED))
+    # Of another's commands: a ground station's, and the camera's beside us.
+    for others in ((255, 190), (7, 100)):
+        script.hear(dialect.MAVLink_command_ack_message(42007, 0, 0, 0, *others))
+    assert script.protocol.source_set.take_outcome() is None
+    script.run(1.0)
+    assert script.commands(42007) == [2, 2, 2, 2]
+    script.hear(dialect.MAVLink_command_ack_message(42007, dialect.MAV_RESULT_DENIED, 0, 0, 7, 197))
     script.run(5.0)
-    assert script.commands(42007) == [2, 2, 2]
+    assert script.commands(42007) == [2, 2, 2, 2]
+    assert script.protocol.source_set.take_outcome() == Outcome(2, False, dialect.MAV_RESULT_DENIED)
     assert "refuses to take EKF source set 2" in caplog.text
 
 
@@ -1068,12 +1109,12 @@ def test_latest_estimate_wins_on_a_choked_line():
         n = 0
         while link.statistics()["estimates_dropped"] < 200 and time.monotonic() < deadline:
             n += 1
-            link.send_estimate(estimate(n * 1000, north=float(n)))
+            link.send_estimate(estimate(time.monotonic_ns(), north=float(n)))
             time.sleep(0.001)
         assert link.statistics()["estimates_dropped"] >= 200 and link.connected()
         assert link.is_alive()
         assert link._transport.pending()
-        last = estimate((n + 1) * 1000, north=float(n + 1))
+        last = estimate(time.monotonic_ns(), north=float(n + 1))
         link.send_estimate(last)
         # Long enough for the thread to take it, were it to queue behind what waits.
         time.sleep(0.1)
@@ -1084,7 +1125,7 @@ def test_latest_estimate_wins_on_a_choked_line():
                 for m in parser.feed(wire.read(), time.monotonic_ns()):
                     if m.get_type() == "ODOMETRY":
                         stamps.append(m.time_usec)
-            return stamps and stamps[-1] == n + 1
+            return stamps and stamps[-1] == last.stamp_ns // 1000
 
         wait_for(drained, 0.4 + (deadline - time.monotonic() if deadline > time.monotonic() else 0))
         assert stamps == sorted(set(stamps)) and len(stamps) < n

@@ -7,7 +7,7 @@ import pytest
 
 from ortholoc_edge.adapters.mavlink.estimates import Autopilot
 from ortholoc_edge.adapters.mavlink.geodesy import moved, ned_from_geodetic
-from ortholoc_edge.adapters.mavlink.monitor import Fusion, FusionMonitor
+from ortholoc_edge.adapters.mavlink.monitor import Fusion, FusionMonitor, FusionReport
 from ortholoc_edge.adapters.mavlink.sinks import earth_model
 from ortholoc_edge.adapters.mavlink.state import GnssPosition
 
@@ -56,6 +56,14 @@ def fly(
         flight.take(estimate, now)
         states.append((now / S, monitor.assess(now + 10 * MS, flight.look, autopilot).state))
     return states
+
+
+def test_silence_ends_what_was_known():
+    monitor = FusionMonitor()
+    monitor._report = monitor._candidate = FusionReport(Fusion.FUSED, S, "its position follows the fixes")
+    report = monitor.silent(9 * S)
+    assert report == FusionReport(Fusion.UNKNOWN, 9 * S, "the autopilot is silent")
+    assert monitor.silent(10 * S).since_ns == 9 * S
 
 
 def test_fused_without_gnss():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import random
 from dataclasses import replace
 
 import numpy as np
@@ -63,6 +64,24 @@ def test_ten_a_second_whatever_the_fixes_do():
     release = make(estimate_rate_hz=20.0)
     assert set(np.diff([now for now, _ in fly(release, flight, 8 * S, regular(flight))])) == {50 * MS}
     assert release.counts["carried"] == 14
+
+
+def test_a_new_fix_goes_at_once_and_the_rate_stays():
+    """Fixes at any time: none waits for a raster, none comes too close, and there are ten a second as planned."""
+    flight, rng = Flight(), random.Random(0)
+    release, at, fixes = make(), S, {}
+    while at < 40 * S:
+        fixes[at] = flight.fix(at - 150 * MS)
+        at += rng.randrange(180, 320) * MS
+    out = fly(release, flight, 40 * S, fixes, start_ns=S, step_ns=MS)
+    first = {outgoing.capture_ns: now for now, outgoing in reversed(out)}
+    waits = [first[fix.stamp_ns] - ready for ready, fix in fixes.items()]
+    assert np.median(waits) == 0 and max(waits) <= 25 * MS
+    assert min(np.diff([now for now, _ in out])) >= 25 * MS
+    assert 9.0 * 39 < len(out) <= 10.0 * 39 + 2
+    # Faster fixes than may go out wait their turn.
+    fast = {S + i * 30 * MS: flight.fix(S + i * 30 * MS - 10 * MS) for i in range(300)}
+    assert len(fly(make(), flight, 10 * S, fast, start_ns=S, step_ns=MS)) <= 93
 
 
 def test_a_loop_that_fell_behind_sends_no_burst():
@@ -227,6 +246,24 @@ def test_raw_is_each_fix_once_as_it_is(options):
         (S + i * 500 * MS + 300 * MS, S + i * 500 * MS) for i in range(10)
     ]
     assert {o.estimate.covariance[0, 0] for _, o in out} == {0.25}
+
+
+@pytest.mark.parametrize("mode", ["raw", "fixed-latency", "fast-forward"])
+def test_what_waited_for_the_line_too_long_is_dropped(mode):
+    flight = Flight()
+    release = make(release=mode)
+    release.take(flight.fix(S), S + 100 * MS, flight.look)
+    assert release.due(9 * S, flight.look) is None and release.counts["too_old"] == 1
+    assert release.next_ns() is None
+    release.take(flight.fix(9 * S), 9 * S + 100 * MS, flight.look)
+    assert release.due(9 * S + 990 * MS, flight.look) is not None
+
+
+def test_a_fix_held_to_the_longest_age_is_not_too_old():
+    flight = Flight()
+    release = make(release="fixed-latency", fixed_latency_ms=1000.0)
+    release.take(flight.fix(3 * S), 3 * S + 300 * MS, flight.look)
+    assert release.due(4 * S + 60 * MS, flight.look) is not None
 
 
 def test_newer_replaces_what_was_not_sent():

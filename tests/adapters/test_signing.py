@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import socket
 import time
 from pathlib import Path
@@ -91,6 +92,22 @@ def test_state_that_cannot_be_written_is_refused_at_the_start(tmp_path):
     with pytest.raises(ConfigError, match="signing_state: stamps can't be stored"):
         link.start()
     link.stop()
+
+
+def test_a_disk_that_filled_up_since_does_not_end_a_restart_in_the_air(tmp_path, caplog):
+    class Full(StampStore):
+        def save(self, stamp: int) -> None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    path = tmp_path / "stamps"
+    path.write_text("37000000000000\n")
+    signing = Signing(b"k" * 32, 0, Full(path), require_signed=False)
+    signing.start(S, 0)
+    assert "No space left" in caplog.text and caplog.records[-1].levelname == "ERROR"
+    assert signing._started.next(S, 0) > 37000000000000
+    path.unlink()
+    with pytest.raises(ConfigError, match="No space left"):
+        Signing(b"k" * 32, 0, Full(path), require_signed=False).start(S, 0)
 
 
 # -- stamps ----------------------------------------------------------------------

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from ortholoc_edge.adapters.mavlink.audit import audit
@@ -14,7 +15,7 @@ from ortholoc_edge.adapters.mavlink.latency import LatencyMeter, advise, ages_of
 from ortholoc_edge.adapters.mavlink.monitor import Fusion, FusionReport
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity
 from ortholoc_edge.adapters.mavlink.parameters import Answer, Reading
-from ortholoc_edge.adapters.mavlink.sources import PendingSwitch, Source, SourceSwitch
+from ortholoc_edge.adapters.mavlink.sources import Outcome, PendingSwitch, Source, SourceSwitch, Switch, Withheld
 from ortholoc_edge.pipeline.witness import Consistency, WitnessReport
 
 from .test_audit import health, situation
@@ -27,8 +28,14 @@ def make(**options) -> SourceSwitch:
     return SourceSwitch(LinkOptions(endpoint="udp:x:1", **options))
 
 
-def decide(switch, consistency, at_s, fresh=True, autopilot=Autopilot.ARDUPILOT, restarts=0):
-    return switch.decide(consistency, fresh, autopilot, restarts, round(at_s * S))
+def decide(switch, consistency, at_s, fresh=True, autopilot=Autopilot.ARDUPILOT, restarts=0, posxy=6, result=0):
+    """``result``: what a command is answered at once; None: it is not, in the end."""
+    now_ns = round(at_s * S)
+    decided = switch.decide(consistency, fresh, autopilot, restarts, now_ns, vision_posxy=posxy)
+    if isinstance(decided, Switch):
+        taken = switch.settle(Outcome(decided.number, result == 0, result), now_ns)
+        assert taken is (decided if result == 0 else None), "announced only if it was accepted"
+    return decided
 
 
 def test_not_unless_enabled_and_of_ardupilot():
@@ -80,13 +87,50 @@ def test_two_sets_are_needed():
 
 def test_command_is_said_until_answered():
     pending = PendingSwitch()
-    assert pending.due(0) is None and pending.answered() is None
+    assert pending.due(0) is None and pending.settle(accepted=True, answer=0) is None
     pending.ask(2)
     assert [pending.due(t * 500 * MS) for t in range(4)] == [2, None, 2, None]
-    assert pending.answered() == 2
+    assert pending.take_outcome() is None
+    pending.settle(accepted=True, answer=0)
     assert pending.due(100 * S) is None
+    assert pending.take_outcome() == Outcome(2, True, 0) and pending.take_outcome() is None
     pending.ask(1)
     assert [pending.due(t * S) for t in range(200, 208)] == [1] * 5 + [None] * 3
+    assert pending.take_outcome() == Outcome(1, False, None), "no answer is no consent"
+
+
+@pytest.mark.parametrize("result", [4, None], ids=["refused", "unanswered"])
+def test_a_switch_that_was_not_taken_is_tried_again_more_and_more_seldom(result):
+    switch = make(switch_sources=True)
+    tries = [t for t in range(1000) if decide(switch, BAD, t, result=result) is not None]
+    assert np.diff(tries).tolist()[:6] == [15, 30, 60, 120, 240, 240]
+    assert not switch.on_vision
+    assert decide(switch, BAD, 2000) is not None and switch.on_vision
+
+
+def test_a_refused_switch_is_not_switched_back_and_an_unanswered_one_is():
+    """The command may have arrived and its answer been lost."""
+    refused, unanswered = make(switch_sources=True), make(switch_sources=True)
+    decide(refused, BAD, 1, result=4)
+    decide(unanswered, BAD, 1, result=None)
+    assert decide(refused, OK, 100) is None
+    assert decide(unanswered, OK, 100).source is Source.GNSS
+    assert decide(unanswered, OK, 200) is None
+
+
+def test_nothing_is_commanded_while_an_answer_is_awaited():
+    switch = make(switch_sources=True)
+    assert switch.decide(BAD, True, Autopilot.ARDUPILOT, 0, S, vision_posxy=6) is not None
+    assert switch.decide(BAD, True, Autopilot.ARDUPILOT, 0, 100 * S, vision_posxy=6) is None and not switch.on_vision
+
+
+@pytest.mark.parametrize("posxy", [None, 0, 3])
+def test_no_switch_to_a_set_that_is_not_known_to_be_of_vision(posxy):
+    switch = make(switch_sources=True)
+    withheld = decide(switch, BAD, 1, posxy=posxy)
+    assert isinstance(withheld, Withheld) and "EK3_SRC2_POSXY" in withheld.text and len(withheld.text) <= 50
+    assert [decide(switch, BAD, t, posxy=posxy) for t in range(2, 100)] == [None] * 98, "said once"
+    assert isinstance(decide(switch, BAD, 100, posxy=6), Switch)
 
 
 def report(state: Fusion, reason: str = "why") -> FusionReport:

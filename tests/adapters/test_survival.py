@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import select
 import socket
 import threading
 import time
@@ -13,11 +14,13 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from ortholoc_edge.adapters.computer import ComputerStatus
 from ortholoc_edge.adapters.mavlink import AutopilotLink, LinkOptions, Severity
 from ortholoc_edge.adapters.mavlink import link as link_module
+from ortholoc_edge.adapters.mavlink.options import parse_endpoint
+from ortholoc_edge.adapters.mavlink.transport import open_transport
 from ortholoc_edge.clock import SystemClock
 
 from .fake_autopilot import FakeAutopilot, PtyWire, TcpWire, UdpWire, Wire
 from .router import GroundStation, Router
-from .test_mavlink import check_attitude, estimate, flying, good_state, wait_for
+from .test_mavlink import check_attitude, estimate, flying, free_udp_port, good_state, heartbeat, wait_for
 
 MS = 1_000_000
 
@@ -148,6 +151,61 @@ def test_half_open_tcp_connection_is_given_up(monkeypatch):
         wait_for(lambda: link.statistics()["reconnects"] >= 1)
         autopilot.mute = False
         wait_for(lambda: wire.accepted >= 2 and good_state(link))
+
+
+def test_a_defect_in_one_message_costs_that_message_only(monkeypatch, caplog):
+    wire = UdpWire()
+    autopilot = FakeAutopilot(wire)
+    link = AutopilotLink(LinkOptions(endpoint=f"udpout:127.0.0.1:{wire.port}"), SystemClock())
+    monkeypatch.setitem(link._protocol._handlers, "HOME_POSITION", lambda m, arrival_ns: 1 // 0)
+    try:
+        with link:
+            wait_for(link.connected)
+            bad = dialect.MAVLink_home_position_message(0, 0, 0, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0)
+            good = dialect.MAVLink_statustext_message(6, b"all is well")
+            mav = dialect.MAVLink(None, 7, 1)
+            for _ in range(3):
+                wire.write(bytes(bad.pack(mav)) + bytes(good.pack(mav)))  # in one datagram
+            wait_for(lambda: link.statistics().get("received.STATUSTEXT", 0) >= 3)
+            assert link.statistics()["internal_errors"] >= 3 and link.is_alive()
+    finally:
+        autopilot.close()
+    assert caplog.text.count("ZeroDivisionError") == 1, "one traceback in ten seconds"
+
+
+def test_a_flood_of_datagrams_leaves_time_to_speak():
+    """Between two chances to speak no more is taken in than some milliseconds of work; what waits is not lost."""
+    transport = open_transport(parse_endpoint(f"udp:127.0.0.1:{(port := free_udp_port())}"))
+    sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    frame = bytes(heartbeat().pack(dialect.MAVLink(None, 7, 1)))
+    turns = []
+    try:
+        for _ in range(2):
+            sender.sendto(b"\xfe" * 60_000, ("127.0.0.1", port))
+        for _ in range(100):
+            sender.sendto(frame, ("127.0.0.1", port))
+        while select.select([transport], [], [], 0.2)[0]:
+            turns.append(transport.receive())
+    finally:
+        transport.close()
+        sender.close()
+    assert max(sum(len(data) for data, _ in turn) for turn in turns) < 2 * 4096
+    assert max(map(len, turns)) <= 64 and len(turns) >= 4
+    assert sum(data == frame for turn in turns for data, _ in turn) == 100
+
+
+def test_timesync_is_answered_under_a_flood():
+    wire = UdpWire()
+    autopilot = FakeAutopilot(wire, autopilot=dialect.MAV_AUTOPILOT_PX4)
+    link = AutopilotLink(LinkOptions(endpoint=f"udpout:127.0.0.1:{wire.port}"), SystemClock())
+    with flying(link, autopilot):
+        wait_for(lambda: autopilot.timesync_answers)
+        before = len(autopilot.timesync_answers)
+        for _ in range(40):
+            wire.write(b"\xfe" * 60_000)
+            time.sleep(0.05)
+        wait_for(lambda: len(autopilot.timesync_answers) > before + 5, 20.0)
+        assert link.connected() and link.statistics()["reconnects"] == 0
 
 
 def test_full_write_buffer_on_tcp_drops_and_goes_on():

@@ -30,6 +30,12 @@ def test_both_times_are_measured(kind):
     assert 0.0 < found.estimate.median_ms < 1000.0 and 0.0 < found.timesync.median_ms < 1000.0
 
 
+def test_fixes_that_are_carried_on_are_measured_by_their_first_estimate():
+    found = link.measure("udp", 4.0, None, 0, "fast-forward")
+    assert found.release == "fast-forward" and found.estimate.count >= 8
+    assert 0.0 < found.estimate.median_ms < 1000.0
+
+
 @pytest.mark.parametrize("kind", ["tcp", "pty"])
 def test_connecting_and_disconnecting_holds_nothing_back(kind):
     found = link.soak(kind, 0.0)

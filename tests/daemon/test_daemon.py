@@ -16,19 +16,21 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import msgspec
 import numpy as np
 import pytest
 from adapters.fake_autopilot import PtyWire, UdpWire, Wire, dialect
-from adapters.firmware_parameters import ARDUPILOT_STOCK
+from adapters.firmware_parameters import ARDUPILOT_READY, ARDUPILOT_STOCK
 from adapters.hovering import PITCH, PLACE, ROLL, TRUE_NED, TRUTH, YAW, HoveringAutopilot, config, running, wait_for
 from replay import rendered
 
 from ortholoc_edge.adapters import systemd
-from ortholoc_edge.adapters.camera import CameraOptions, EndOfFrames
+from ortholoc_edge.adapters.bus import AutopilotRecord
+from ortholoc_edge.adapters.camera import CameraOptions, EndOfFrames, FrameSource, open_source
+from ortholoc_edge.clock import SystemClock
 from ortholoc_edge.config import Config, LogOptions, MountOptions
 from ortholoc_edge.daemon import Daemon, LatestSlot
 from ortholoc_edge.errors import MapError, OrtholocError
@@ -156,12 +158,15 @@ def test_without_an_origin_nothing_is_sent(folder: Path) -> None:
             texts = wait_for(
                 lambda: [m.text for m in autopilot.messages("STATUSTEXT") if "origin" in m.text], "the warning"
             )
+            told = len(autopilot.messages("HEARTBEAT"))
+            wait_for(lambda: len(autopilot.messages("HEARTBEAT")) >= told + 3, "three seconds more")
+            texts = [m.text for m in autopilot.messages("STATUSTEXT") if "origin" in m.text]
     finally:
         autopilot.close()
     assert autopilot.messages("ODOMETRY") == []
     assert autopilot.messages("VISION_POSITION_ESTIMATE") == []
     assert autopilot.got_counts["SET_GPS_GLOBAL_ORIGIN"] == 0
-    assert "not sent" in texts[0]
+    assert len(texts) == 1 and "not sent" in texts[0]
 
 
 def test_wrong_settings_are_told_once(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -256,10 +261,11 @@ def test_gnss_on_another_continent_is_survived(folder: Path, monkeypatch: pytest
 class _SpoofedAutopilot(HoveringAutopilot):
     """Its GNSS is ``beside_m`` to the north; keeps commands for the EKF's source set."""
 
-    def __init__(self, wire: Wire) -> None:
+    def __init__(self, wire: Wire, with_origin: bool = True) -> None:
         self.beside_m = 0.0
         self.source_sets: list[int] = []
-        super().__init__(wire)
+        super().__init__(wire, with_origin)
+        self.parameters = {**ARDUPILOT_READY, "EK3_SRC3_POSXY": 6}
 
     def _stream(self, message_id: int, now_ns: int) -> Any:
         message = super()._stream(message_id, now_ns)
@@ -273,9 +279,7 @@ class _SpoofedAutopilot(HoveringAutopilot):
         super()._take(message)
 
 
-def test_spoofed_gnss_is_told_and_the_source_switched_where_enabled(folder: Path) -> None:
-    wire = UdpWire()
-    autopilot = _SpoofedAutopilot(wire)
+def switching(folder: Path, wire: UdpWire) -> Daemon:
     base = config(
         f"folder:{folder}", f"udpout:127.0.0.1:{wire.port}",
         # Fewer frames than in flight: it is the same with its own limits (tests/pipeline/test_witness.py).
@@ -286,7 +290,32 @@ def test_spoofed_gnss_is_told_and_the_source_switched_where_enabled(folder: Path
         camera=CameraOptions(source=f"folder:{folder}", rate_hz=2.0),
         link=msgspec.structs.replace(base.link, switch_sources=True, vision_source_set=3),
     )
-    daemon = Daemon(enabled)
+    return Daemon(enabled)
+
+
+def test_no_switch_to_vision_while_no_estimate_goes_out(folder: Path) -> None:
+    """Fixes there are, and GNSS is bad; but without an origin the filter gets none of them."""
+    wire = UdpWire()
+    autopilot = _SpoofedAutopilot(wire, with_origin=False)
+    daemon = switching(folder, wire)
+    try:
+        with running(daemon):
+            wait_for(lambda: cast(int, daemon.statistics().get("fixes", 0)) >= 2, "two fixes")
+            autopilot.beside_m = 40.0
+            wait_for(lambda: daemon.statistics()["gnss_consistency"] == "bad", "GNSS found bad", 40.0)
+            wait_for(lambda: any("GNSS contradicts camera" in str(m.text) for m in autopilot.messages("STATUSTEXT")),
+                     "a word about it")  # fmt: skip
+            beats = len(autopilot.messages("HEARTBEAT"))
+            wait_for(lambda: len(autopilot.messages("HEARTBEAT")) >= beats + 2, "two seconds more")
+    finally:
+        autopilot.close()
+    assert autopilot.source_sets == []
+
+
+def test_spoofed_gnss_is_told_and_the_source_switched_where_enabled(folder: Path) -> None:
+    wire = UdpWire()
+    autopilot = _SpoofedAutopilot(wire)
+    daemon = switching(folder, wire)
     try:
         with running(daemon):
             wait_for(lambda: autopilot.messages("ODOMETRY"), "an estimate")
@@ -299,6 +328,36 @@ def test_spoofed_gnss_is_told_and_the_source_switched_where_enabled(folder: Path
                      f"a word about it, not {texts}")  # fmt: skip
             assert daemon.statistics()["fixes"] > 0
             assert set(autopilot.source_sets) == {3}
+    finally:
+        autopilot.close()
+
+
+class _Bus:
+    """Keeps what is published of the autopilot."""
+
+    dropped = 0
+
+    def __init__(self) -> None:
+        self.records: list[AutopilotRecord] = []
+
+    def publish(self, outcome: Outcome) -> None:
+        pass
+
+    def publish_autopilot(self, record: AutopilotRecord) -> None:
+        self.records.append(record)
+
+
+def test_a_lost_link_is_published(folder: Path) -> None:
+    wire = UdpWire()
+    autopilot = HoveringAutopilot(wire)
+    daemon = Daemon(config(f"folder:{folder}", f"udpout:127.0.0.1:{wire.port}"))
+    bus = daemon._bus = _Bus()  # type: ignore[assignment]
+    try:
+        with running(daemon):
+            wait_for(lambda: any(record.connected for record in bus.records), "a record of the autopilot")
+            autopilot.mute = True
+            wait_for(lambda: bus.records and not bus.records[-1].connected, "a record that it is lost")
+            assert bus.records[-1].fusion == "unknown"
     finally:
         autopilot.close()
 
@@ -347,20 +406,44 @@ def test_a_place_needs_no_origin_and_does_not_jump_with_it(folder: Path) -> None
     assert autopilot.messages("ODOMETRY") == []
 
 
-def test_recovery_is_told_once(folder: Path) -> None:
+class _Covered:
+    """The folder's camera, with a lid."""
+
+    def __init__(self, frames: FrameSource) -> None:
+        self._frames = frames
+        self.is_covered = False
+
+    def read(self, timeout_s: float) -> Frame | None:
+        frame = self._frames.read(timeout_s)
+        return None if self.is_covered else frame
+
+    def close(self) -> None:
+        self._frames.close()
+
+
+def test_recovery_is_told_once_for_each_outage_and_not_at_the_start(folder: Path) -> None:
     wire = UdpWire()
     autopilot = HoveringAutopilot(wire)
-    daemon = Daemon(automatic(folder, wire, recovery=True))
+    settings = automatic(folder, wire, recovery=True)
+    camera = _Covered(open_source(settings.camera, SystemClock()))
+    daemon = Daemon(settings, frames=camera)
     try:
         with running(daemon):
-            wait_for(lambda: len(autopilot.messages("ODOMETRY")) >= 4, "four ODOMETRY")
+            wait_for(lambda: len(autopilot.messages("ODOMETRY")) >= 2, "two ODOMETRY")
+            camera.is_covered = True
+            wait_for(lambda: not daemon.link.estimate_sent_since(time.monotonic_ns() - 1_500_000_000), "an outage")
+            before = len(autopilot.messages("ODOMETRY"))
+            camera.is_covered = False
+            wait_for(lambda: len(autopilot.messages("ODOMETRY")) >= before + 2, "two more")
     finally:
         autopilot.close()
-    (command,) = autopilot.messages("COMMAND_INT")
+    kinds = [m.get_type() for m in autopilot.got if m.get_type() in ("COMMAND_INT", "ODOMETRY")]
+    commands = [place for place, kind in enumerate(kinds) if kind == "COMMAND_INT"]
+    # Besides ours, whatever pause this machine made of its own is one.
+    assert before in commands and kinds[0] == "ODOMETRY" and kinds[before + 1] == "ODOMETRY"
+    command = autopilot.messages("COMMAND_INT")[-1]
     assert command.command == dialect.MAV_CMD_EXTERNAL_POSITION_ESTIMATE
     assert command.x == pytest.approx(PLACE.lat_deg * 1e7, abs=300)
-    kinds = [m.get_type() for m in autopilot.got if m.get_type() in ("COMMAND_INT", "ODOMETRY")]
-    assert kinds[:2] == ["COMMAND_INT", "ODOMETRY"]
 
 
 def test_watchdog_starves_when_the_camera_hangs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

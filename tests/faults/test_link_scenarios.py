@@ -28,7 +28,7 @@ from ortholoc_edge.adapters.mavlink import AutopilotLink, LinkOptions
 from ortholoc_edge.adapters.mavlink import link as link_module
 from ortholoc_edge.adapters.mavlink.estimates import Autopilot
 from ortholoc_edge.adapters.mavlink.release import Release
-from ortholoc_edge.adapters.mavlink.sources import SourceSwitch
+from ortholoc_edge.adapters.mavlink.sources import SourceSwitch, Switch
 from ortholoc_edge.clock import SystemClock
 from ortholoc_edge.daemon import Daemon
 from ortholoc_edge.geometry import rotation
@@ -417,8 +417,8 @@ def spoof_ramp() -> None:
         drawn_m = max(drawn_m, float(np.linalg.norm((prior.map_from_camera.translation - centre)[:2])))
         tracker.update(fix_at(centre, script.now), state)
         consistency = tracker.witness.report.state
-        command = switch.decide(consistency, True, Autopilot.ARDUPILOT, 0, script.now)
-        if command is not None:
+        command = switch.decide(consistency, True, Autopilot.ARDUPILOT, 0, script.now, vision_posxy=6)
+        if isinstance(command, Switch):
             script.protocol.source_set.ask(command.number)
         if consistency is Consistency.BAD and found_after_m is None:
             found_after_m = away_m

@@ -109,8 +109,13 @@ class Census:
         if message.get_type() != "HEARTBEAT":
             return
         key = message.get_srcSystem(), message.get_srcComponent()
-        if key in self._peers or len(self._peers) < _MOST_PEERS:
-            self._peers[key] = Peer(*key, _AUTOPILOTS.get(message.autopilot, "other"), _role(message))
+        self._peers[key] = Peer(*key, _AUTOPILOTS.get(message.autopilot, "other"), _role(message))
+        self._peers.move_to_end(key)
+        if len(self._peers) > _MOST_PEERS:
+            # The one that was not heard for longest, and no autopilot while there are others: a flood of invented
+            # ones must not hide it.
+            others = (key for key, peer in self._peers.items() if peer.autopilot in (None, "other"))
+            del self._peers[next(others, next(iter(self._peers)))]
 
     def take_vehicles(self, name: str, now_ns: int) -> None:
         """A message of the vehicle that we serve."""

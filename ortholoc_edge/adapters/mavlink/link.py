@@ -8,6 +8,7 @@ import os
 import select
 import socket
 import threading
+import traceback
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping
 from types import TracebackType
@@ -26,8 +27,10 @@ from ortholoc_edge.adapters.mavlink.monitor import FusionReport
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus, parse_endpoint
 from ortholoc_edge.adapters.mavlink.parameters import Number, Reading, Written
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol, Statistic
+from ortholoc_edge.adapters.mavlink.release import MAX_AGE_MS
 from ortholoc_edge.adapters.mavlink.signing import ACCEPTED, STORE_INTERVAL_S, Verdict, make_signing
 from ortholoc_edge.adapters.mavlink.sinks import Sink
+from ortholoc_edge.adapters.mavlink.sources import Outcome
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity, AutopilotState
 from ortholoc_edge.adapters.mavlink.transport import Transport, open_transport
 from ortholoc_edge.clock import Clock, wall_clock_ns
@@ -76,10 +79,17 @@ class AutopilotLink:
     again it ends, and :attr:`failure` says why; the daemon should then end too.
     """
 
-    def __init__(self, options: LinkOptions, clock: Clock, gimbal: GimbalSelection | None = None) -> None:
+    def __init__(
+        self,
+        options: LinkOptions,
+        clock: Clock,
+        gimbal: GimbalSelection | None = None,
+        max_age_ms: float = MAX_AGE_MS,
+    ) -> None:
         """
         Args:
             gimbal: the one that carries the camera; None: a fixed mount.
+            max_age_ms: a fix that is older when the line has room for it is dropped and counted.
         Raises: ConfigError if the endpoint can't be understood, a serial line can't carry what is asked of it, or the
             signing key can't be used.
         """
@@ -87,7 +97,7 @@ class AutopilotLink:
         self._plan = plan_line(options, self._endpoint, has_gimbal=gimbal is not None)
         self._plan.require_fit()
         self._options, self._clock = options, clock
-        self._protocol = LinkProtocol(options, gimbal)
+        self._protocol = LinkProtocol(options, gimbal, max_age_ms)
         self._mav = dialect.MAVLink(None, 0, options.component_id)
         self._signing = make_signing(options, os.environ)
         if self._signing is not None:
@@ -98,7 +108,6 @@ class AutopilotLink:
         self._thread: threading.Thread | None = None
         self._transport: Transport | None = None
         self._wake_pair: tuple[socket.socket, socket.socket] | None = None
-        self._recovery = False
         self._texts: deque[MavlinkMessage] = deque(maxlen=16)
         self._text_id = 0
         self._log = LimitedLog()
@@ -201,20 +210,22 @@ class AutopilotLink:
         with self._lock:
             return self._protocol.sinks
 
-    def send_estimate(self, estimate: VisionEstimate, recovery: bool = False) -> None:
+    def send_estimate(self, estimate: VisionEstimate) -> None:
         """Hand a fix over; when and how often it goes out is ``options.release``'s. One that was not sent yet is
         replaced and counted: newer is better.
-
-        Args:
-            recovery: the first one after an outage; told as such with the next that is sent, if
-                ``options.recovery`` allows it.
+        The first one after an outage (`LinkProtocol.is_outage`) is told as such, if ``options.recovery`` allows it.
         """
         with self._lock:
             self._counts["estimates_dropped"] += self._protocol.release.take(
                 estimate, self._clock.now_ns(), self._protocol.state_at
             )
-            self._recovery |= recovery
         self._wake()
+
+    def estimate_sent_since(self, since_ns: int) -> bool:
+        """Whether an estimate left the link after ``since_ns``: the line took it, whatever became of it there."""
+        with self._lock:
+            sent_ns = self._protocol.last_sent_ns
+        return sent_ns is not None and sent_ns > since_ns
 
     @property
     def fusion(self) -> FusionReport:
@@ -260,10 +271,16 @@ class AutopilotLink:
             return meter.percentile_ms(50.0), meter.percentile_ms(99.0)
 
     def take_source_set(self, number: int) -> None:
-        """Command an ArduPilot to use a source set; repeated until it answers."""
+        """Command an ArduPilot to use a source set; repeated until it answers, five times at most. What came of it
+        is told by :meth:`source_set_outcome`."""
         with self._lock:
             self._protocol.source_set.ask(number)
         self._wake()
+
+    def source_set_outcome(self) -> Outcome | None:
+        """Of a :meth:`take_source_set` that came to its end since the last call, if one did."""
+        with self._lock:
+            return self._protocol.source_set.take_outcome()
 
     def send_status_text(self, severity: Severity, text: str) -> None:
         """Show a line at the ground station. Cut at 200 characters; of more than 16 waiting parts the oldest
@@ -447,20 +464,25 @@ class AutopilotLink:
                 and now_ns - last_heard_ns > _TCP_SILENCE_NS
             ):
                 raise ConnectionError(f"nothing came for {_TCP_SILENCE_NS // _S} s")
+            errors: list[Exception] = []
+            for data, peer in arrived:
+                errors += self._take(transport, data, peer, now_ns)
             try:
-                for data, peer in arrived:
-                    self._take(transport, data, peer, now_ns)
                 self._say(transport)
-                errors_in_a_row = 0
             except OSError:
                 raise
-            except Exception:
-                # A defect of ours must not take attitude and estimates from the vehicle; unless it stays.
-                self._counts["internal_errors"] += 1
-                errors_in_a_row += 1
-                if errors_in_a_row >= _GIVE_UP_AFTER_ERRORS:
-                    raise
-                logger.exception("autopilot link: one item was left out")
+            except Exception as error:
+                errors.append(self._left_out(error))
+            # A defect of ours must not take attitude and estimates from the vehicle; unless it stays.
+            errors_in_a_row = errors_in_a_row + 1 if errors else 0
+            if errors_in_a_row >= _GIVE_UP_AFTER_ERRORS:
+                raise errors[-1]
+
+    def _left_out(self, error: Exception) -> Exception:
+        self._counts["internal_errors"] += 1
+        told = "".join(traceback.format_exception(error))
+        self._log(self._clock.now_ns(), logging.ERROR, "internal", f"autopilot link: one item was left out\n{told}")
+        return error
 
     def _wait_s(self) -> float:
         """Until something is due, and never long."""
@@ -472,7 +494,8 @@ class AutopilotLink:
         # What was due before waits for the line, which select tells of; a loop without a pause would not help it.
         return _SELECT_TIMEOUT_S if left_s <= 0.0 else min(left_s, _SELECT_TIMEOUT_S)
 
-    def _take(self, transport: Transport, data: bytes, peer: Any, now_ns: int) -> None:
+    def _take(self, transport: Transport, data: bytes, peer: Any, now_ns: int) -> list[Exception]:
+        """Take in what arrived; returns the errors of ours that single messages met with."""
         with self._lock:
             parser = self._parsers.get(peer)
             if parser is None:
@@ -480,21 +503,31 @@ class AutopilotLink:
                 if len(self._parsers) >= 8:
                     self._retire(self._parsers.pop(next(iter(self._parsers))))
                 parser = self._parsers[peer] = FrameParser(lambda message: self._accepts(transport, message, peer))
+        errors = []
         for message in parser.feed(data, now_ns):
-            self._counts["messages"] += 1
-            self._counts[f"received_bytes.{message.get_type()}"] += len(message.get_msgbuf())
-            with self._lock:
-                answers = self._protocol.on_message(message, now_ns)
-                vehicle = self._protocol.vehicle
-            # Replies go where our autopilot is. Until it was heard, to whoever speaks MAVLink.
-            ours = vehicle is not None and message.get_srcSystem() == vehicle.system_id
-            if ours and self._protocol.is_vehicle_heartbeat(message):
-                transport.prefer(peer)
-                self._peer_is_vehicle = True
-            elif not self._peer_is_vehicle:
-                transport.prefer(peer)
-            for answer in answers:
-                self._send(transport, answer)
+            try:
+                self._take_message(transport, message, peer, now_ns)
+            except OSError:
+                raise
+            except Exception as error:
+                errors.append(self._left_out(error))
+        return errors
+
+    def _take_message(self, transport: Transport, message: MavlinkMessage, peer: Any, now_ns: int) -> None:
+        self._counts["messages"] += 1
+        self._counts[f"received_bytes.{message.get_type()}"] += len(message.get_msgbuf())
+        with self._lock:
+            answers = self._protocol.on_message(message, now_ns)
+            vehicle = self._protocol.vehicle
+        # Replies go where our autopilot is. Until it was heard, to whoever speaks MAVLink.
+        ours = vehicle is not None and message.get_srcSystem() == vehicle.system_id
+        if ours and self._protocol.is_vehicle_heartbeat(message):
+            transport.prefer(peer)
+            self._peer_is_vehicle = True
+        elif not self._peer_is_vehicle:
+            transport.prefer(peer)
+        for answer in answers:
+            self._send(transport, answer)
 
     def _accepts(self, transport: Transport, message: MavlinkMessage, peer: Any) -> bool:
         """Whether a frame's signature lets it count."""
@@ -521,13 +554,15 @@ class AutopilotLink:
         with self._lock:
             messages = self._protocol.poll(now_ns)
             # While bytes wait, an estimate stays where a newer one can still replace it.
-            look = self._protocol.state_at
-            outgoing = None if transport.pending() else self._protocol.release.due(now_ns, look)
+            too_old = self._protocol.release.counts["too_old"]
+            outgoing = None if transport.pending() else self._protocol.due_estimate(now_ns)
+            self._counts["estimates_dropped"] += self._protocol.release.counts["too_old"] - too_old
             if outgoing is not None:
                 encoded = []
                 if self._protocol.connected(now_ns):
                     wall_ns = wall_clock_ns()
-                    encoded = self._protocol.encode_estimate(outgoing.estimate, now_ns, wall_ns, self._recovery)
+                    is_outage = self._protocol.is_outage(now_ns)
+                    encoded = self._protocol.encode_estimate(outgoing.estimate, now_ns, wall_ns, is_outage)
                 if not encoded:
                     self._counts["estimates_dropped"] += 1
             else:
@@ -535,9 +570,10 @@ class AutopilotLink:
             while self._texts:
                 messages.append(self._texts.popleft())
         went_out = [self._send(transport, message) for message in encoded]
-        if outgoing is not None and any(went_out):
+        # Not the command of a recovery, which may have gone before it.
+        is_out = any(ok and m.get_type() in _CARRY_ESTIMATES for m, ok in zip(encoded, went_out, strict=True))
+        if outgoing is not None and is_out:
             with self._lock:
-                self._recovery = False
                 self._protocol.sent(outgoing, now_ns)
         for message in messages:
             self._send(transport, message)

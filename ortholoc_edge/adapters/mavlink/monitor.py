@@ -48,6 +48,8 @@ _POSITION_FLAG = dialect.ESTIMATOR_POS_HORIZ_ABS  # bit 4 with both
 _CONSTANT_FLAG = dialect.ESTIMATOR_CONST_POS_MODE  # bit 7 with both
 _UNINITIALISED_FLAG = dialect.EKF_UNINITIALIZED  # ArduPilot's bit 10, PX4's GPS_GLITCH
 
+_SILENT = "the autopilot is silent"
+
 Look = Callable[[int], AutopilotState | None]
 
 
@@ -130,6 +132,14 @@ class FusionMonitor:
             self._said = "gnss"
         elif "stopped aiding" in lowered or "source set" in lowered:
             self._said = None
+
+    def silent(self, now_ns: int) -> FusionReport:
+        """The autopilot is not heard: nothing that was seen before is known of now."""
+        self._probes.clear()
+        self._said = None
+        if self._report.state is not Fusion.UNKNOWN or self._report.reason != _SILENT:
+            self._report = self._candidate = FusionReport(Fusion.UNKNOWN, now_ns, _SILENT)
+        return self._report
 
     def assess(self, now_ns: int, look: Look, autopilot: Autopilot) -> FusionReport:
         """The state now."""

@@ -75,7 +75,7 @@ class Outlet:
         Args:
             origin: the autopilot's EKF origin, None while it has none.
             wall_ns: UNIX time, for GPS_INPUT.
-            recovery: whether this is the first fix after an outage. If that may be told, it goes first: a filter
+            recovery: whether this is the first estimate after an outage. If that may be told, it goes first: a filter
                 that has fused the estimate already does not take the command.
         """
         sinks = self.sinks(vehicle)

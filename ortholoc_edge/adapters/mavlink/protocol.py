@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections import Counter
+from collections import Counter, OrderedDict
 from collections.abc import Callable
 
 from ortholoc_edge.adapters.computer import ComputerStatus
@@ -18,7 +18,7 @@ from ortholoc_edge.adapters.mavlink.monitor import FusionMonitor, FusionReport
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus
 from ortholoc_edge.adapters.mavlink.outlet import Outlet
 from ortholoc_edge.adapters.mavlink.parameters import ParameterClient
-from ortholoc_edge.adapters.mavlink.release import Outgoing, Release
+from ortholoc_edge.adapters.mavlink.release import MAX_AGE_MS, Outgoing, Release
 from ortholoc_edge.adapters.mavlink.sinks import Sink
 from ortholoc_edge.adapters.mavlink.sources import PendingSwitch
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity, AutopilotState
@@ -43,6 +43,12 @@ _AUTOPILOTS = {
 # An autopilot sends HEARTBEAT at 1 Hz; three missing is how ground stations judge it too.
 _SILENT_AFTER_NS = 3 * _S
 
+# The same text is logged once in this time; of this many texts it is known when that was.
+_TEXT_AGAIN_NS = 10 * _S
+_MOST_TEXTS = 256
+# ArduPilot sets its position by command only while its filter has fused none for a second.
+_OUTAGE_NS = 1 * _S
+
 
 def _repeat_at(rate_hz: float) -> Repeat | None:
     return Repeat(int(_S / rate_hz)) if rate_hz > 0 else None
@@ -55,21 +61,26 @@ class LinkProtocol:
     and sends what both return, in order.
     """
 
-    def __init__(self, options: LinkOptions, gimbal: GimbalSelection | None = None) -> None:
+    def __init__(
+        self, options: LinkOptions, gimbal: GimbalSelection | None = None, max_age_ms: float = MAX_AGE_MS
+    ) -> None:
+        """Args: as of :class:`AutopilotLink`."""
         self._options = options
         self._log = LimitedLog()
         self.system_status = SystemStatus.BOOT
         self.computer: ComputerStatus | None = None
         self._last_sent: Outgoing | None = None
+        self.last_sent_ns: int | None = None
         self.timesync = TimeSync()
         self.counts: Counter[str] = Counter()
         self.telemetry = Telemetry(
             self.timesync, self.counts, options.attitude_rate_hz, options.position_rate_hz, gimbal
         )
-        self.release = Release(options)
+        self.release = Release(options, max_age_ms)
         self.latency = LatencyMeter()
         self.monitor = FusionMonitor()
         self.source_set = PendingSwitch()
+        self._texts_told: OrderedDict[str, int] = OrderedDict()
         self._advice: DelayAdvice | None = None
         self.parameters = ParameterClient()
         self._census = Census()
@@ -250,6 +261,7 @@ class LinkProtocol:
         for timer in (self._version_timer, self._origin_timer, self._home_timer):
             timer.restart()
         self.parameters.restart()
+        self.source_set.settle(accepted=False, answer=None)
         self._census.restart()
 
     def _on_timesync(self, m: MavlinkMessage, arrival_ns: int) -> None:
@@ -276,14 +288,26 @@ class LinkProtocol:
         level = logging.WARNING if m.severity <= Severity.ERROR else logging.INFO
         # Printable only: what comes over a radio must not steer a terminal.
         text = "".join(c if c.isprintable() else "?" for c in str(m.text))
-        self._log(arrival_ns, level, f"text.{hash(text) % 64}", f"autopilot says: {text}")
+        # By the text itself: one that repeats must not hide another.
+        if text in self._texts_told and arrival_ns - self._texts_told[text] < _TEXT_AGAIN_NS:
+            self.counts["texts_repeated"] += 1
+        else:
+            self._texts_told[text] = arrival_ns
+            self._texts_told.move_to_end(text)
+            if len(self._texts_told) > _MOST_TEXTS:
+                self._texts_told.popitem(last=False)
+            logger.log(level, "autopilot says: %s", text)
         self.monitor.heard(text)
 
     def _on_command_ack(self, m: MavlinkMessage, arrival_ns: int) -> None:
+        # Zeros: for whoever asked, from firmware that does not say whom it answers.
+        if m.target_system not in (0, self.own_system_id) or m.target_component not in (0, self._options.component_id):
+            self.counts["acks_for_others"] += 1
+            return
         if m.command == dialect.MAV_CMD_SET_EKF_SOURCE_SET and m.result != dialect.MAV_RESULT_IN_PROGRESS:
-            number = self.source_set.answered()
-            if number is not None and m.result != dialect.MAV_RESULT_ACCEPTED:
-                logger.warning("autopilot refuses to take EKF source set %d (result %d)", number, m.result)
+            outcome = self.source_set.settle(accepted=m.result == dialect.MAV_RESULT_ACCEPTED, answer=m.result)
+            if outcome is not None and not outcome.accepted:
+                logger.warning("autopilot refuses to take EKF source set %d (result %d)", outcome.number, m.result)
         if m.result not in (dialect.MAV_RESULT_ACCEPTED, dialect.MAV_RESULT_IN_PROGRESS):
             self.counts["commands_refused"] += 1
 
@@ -315,6 +339,10 @@ class LinkProtocol:
                 self._silent = True
                 self.counts["silences"] += 1
                 logger.warning("autopilot silent: no heartbeat for %d s", _SILENT_AFTER_NS // _S)
+            # A switch is of the moment: not one that is said to an autopilot that comes back.
+            self.source_set.settle(accepted=False, answer=None)
+            if self._monitor_timer.due(now_ns):
+                self.monitor.silent(now_ns)
             # Nothing is asked of a mute peer; its answers to a backlog of requests would come in one burst.
             return out
         ts1 = self.timesync.due(now_ns)
@@ -357,9 +385,21 @@ class LinkProtocol:
         number = self.source_set.due(now_ns)
         return [] if number is None else [self._command(dialect.MAV_CMD_SET_EKF_SOURCE_SET, number)]
 
+    def due_estimate(self, now_ns: int) -> Outgoing | None:
+        """The estimate to send now, if any."""
+        before = self.release.counts["too_old"]
+        outgoing = self.release.due(now_ns, self.state_at)
+        if self.release.counts["too_old"] != before:
+            self._log(now_ns, logging.WARNING, "too_old", "a fix that waited too long for the line is not sent")
+        return outgoing
+
+    def is_outage(self, now_ns: int) -> bool:
+        """Whether estimates flowed and none left for so long that ArduPilot takes a new position by command."""
+        return self.last_sent_ns is not None and now_ns - self.last_sent_ns > _OUTAGE_NS
+
     def sent(self, outgoing: Outgoing, now_ns: int) -> None:
         """An estimate was handed to the line."""
-        self._last_sent = outgoing
+        self._last_sent, self.last_sent_ns = outgoing, now_ns
         if outgoing.repeat == 0:
             self.counts["fixes_sent"] += 1
             self.latency.add(now_ns - outgoing.capture_ns)

@@ -59,6 +59,12 @@ _ATTITUDE_DRIFT_RAD_PER_S = math.radians(0.3)
 _CONTRADICTION_SIGMAS = 5.0
 _CONTRADICTIONS, _AGREEMENTS = 2, 5
 _COMPARE_NS = 5 * _S
+# The age beyond which a fix is not sent where the owner names none, as `[timing] max_age_ms`; and how late one may be
+# that is held to an age.
+MAX_AGE_MS = 1000.0
+_HELD_LATE_NS = 250 * _MS
+# ArduPilot drops what comes within 20 ms of the one before.
+_LEAST_GAP_NS = 25 * _MS
 # Held fixes: more than these are never under way, unless time stands still.
 _HELD = 16
 
@@ -108,19 +114,27 @@ class Release:
             sent as they are because they could not be carried on), ``repeats_broken`` (ended by an epoch, an origin),
             ``repeats_ended`` (no new fix), ``repeats_fewer`` (more would have had sigmas beyond what is believed),
             ``contradicted`` (displacements that two fixes contradict),
-            ``bad_capture_stamps``, ``late_for_release``.
+            ``bad_capture_stamps``, ``late_for_release``, ``too_old`` (dropped: a line that was choked or away).
     """
 
-    def __init__(self, options: LinkOptions) -> None:
+    def __init__(self, options: LinkOptions, max_age_ms: float = MAX_AGE_MS) -> None:
+        """
+        Args:
+            max_age_ms: a fix goes out for the first time no older than this; where it is held to an age, no older
+                than that and a little.
+        """
         self.believed = (math.inf, math.inf)
         self.mode = "raw" if options.estimate_rate_hz == 0.0 else options.release
         self.counts: Counter[str] = Counter()
         self._period_ns = round(_S / options.estimate_rate_hz) if options.estimate_rate_hz > 0.0 else 0
         self._max_repeat_ns = round(options.max_repeat_s * _S)
         self._latency_ns = round(options.fixed_latency_ms * _MS)
+        self._max_age_ns = round(max_age_ms * _MS)
+        if self.mode == "fixed-latency":
+            self._max_age_ns = max(self._max_age_ns, self._latency_ns + _HELD_LATE_NS)
         self._held: deque[_Taken] = deque(maxlen=_HELD)
         self._fix: _Taken | None = None
-        self._next_ns = 0
+        self._next_ns = self._sent_ns = 0
         self._intervals_ns: deque[int] = deque(maxlen=5)
         self._newest: _Taken | None = None
         self._in_doubt = False
@@ -160,23 +174,40 @@ class Release:
             return self._held[0].estimate.stamp_ns + self._latency_ns if self._held else None
         if self._fix is None:
             return None
-        return 0 if self.mode == "raw" else self._next_ns
+        return 0 if self.mode == "raw" else self._turn_ns(self._fix)
 
     def due(self, now_ns: int, look: Look) -> Outgoing | None:
         """What is to be sent now, if anything."""
         if self.mode == "fixed-latency":
+            while self._held and self._is_too_old(self._held[0], now_ns):
+                self._held.popleft()
             ripe = self._held and now_ns >= self._held[0].estimate.stamp_ns + self._latency_ns
             return _as_it_is(self._held.popleft()) if ripe else None
         fix = self._fix
         if fix is None:
+            return None
+        if fix.released == 0 and self._is_too_old(fix, now_ns):
+            self._fix = None
             return None
         if self.mode == "raw":
             self._fix = None
             return _as_it_is(fix)
         return self._due_carried(fix, now_ns, look)
 
+    def _turn_ns(self, fix: _Taken) -> int:
+        """When the next estimate of a fix may go. A new fix goes at once and takes the turn that comes next, so that as
+        many go in a second as without it; but no two turns ahead, and not so close that ArduPilot drops it."""
+        if fix.released > 0:
+            return self._next_ns
+        return max(self._next_ns - self._period_ns, self._sent_ns + min(self._period_ns, _LEAST_GAP_NS))
+
+    def _is_too_old(self, fix: _Taken, now_ns: int) -> bool:
+        is_old = now_ns - fix.estimate.stamp_ns > self._max_age_ns
+        self.counts["too_old"] += is_old
+        return is_old
+
     def _due_carried(self, fix: _Taken, now_ns: int, look: Look) -> Outgoing | None:
-        if now_ns < self._next_ns:
+        if now_ns < self._turn_ns(fix):
             return None
         if now_ns - fix.arrival_ns > self._max_repeat_ns and fix.released > 0:
             self.counts["repeats_ended"] += 1
@@ -185,6 +216,7 @@ class Release:
         # On its raster, but not two at once where the loop fell behind: ArduPilot drops what comes within 20 ms.
         if now_ns - self._next_ns >= self._period_ns:
             self._next_ns = now_ns
+        self._sent_ns = now_ns
         self._next_ns += self._period_ns
         if self._next_ns - now_ns < self._period_ns // 2:
             self._next_ns += self._period_ns

@@ -174,7 +174,7 @@ class Signing:
     def start(self, now_ns: int, unix_ns: int) -> None:
         """Begin where the life before can't have been, and see that what we use can be stored.
 
-        Raises: ConfigError if it can't.
+        Raises: ConfigError if it can't, and never could.
         """
         stored, wall = self._store.load(), stamp_of(unix_ns)
         if wall < _CLOCK_NOT_SET_BEFORE and stored is None:
@@ -186,6 +186,13 @@ class Signing:
         try:
             self.store()
         except OSError as error:
+            if stored is not None:
+                # A disk that filled up since is no error of configuration, and this may be a restart in the air.
+                logger.error(
+                    "signing's stamps can't be stored (%s); going on from the stored one. Until they can be, a restart "
+                    "would use stamps again if the wall clock is behind", error,
+                )  # fmt: skip
+                return
             raise ConfigError(
                 f"[link] signing_state: stamps can't be stored ({error}); without that they would repeat after a "
                 "restart. Name a file in a folder that may be written"

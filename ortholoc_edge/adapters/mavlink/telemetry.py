@@ -32,6 +32,8 @@ _HISTORY_NS = 10 * _S
 
 _MAX_EXTRAPOLATION_NS = 200 * _MS
 _GNSS_FRESH_NS = 1500 * _MS
+# Its reports come at 1 Hz or more.
+_ESTIMATOR_FRESH_NS = 3 * _S
 _GNSS_MAX_HDOP = 4.0
 _GNSS_MAX_SIGMA_M = 25.0
 # A receiver's h_acc and v_acc are of its noise. What they leave out does not average away: ETRS89, which maps are
@@ -131,7 +133,8 @@ class Telemetry:
         self._landed: bool | None = None
         self._origin: GeodeticOrigin | None = None
         self._gps_raws: deque[_GpsRaw] = deque(maxlen=_GPS_CAPACITY)
-        self._estimator: tuple[int, float] | None = None
+        # When it was heard, flags and test ratio.
+        self._estimator: tuple[int, int, float] | None = None
         self._epoch = 0
         self._newest_boot_ns: int | None = None
         self._watch = ClockWatch(timesync)
@@ -213,6 +216,7 @@ class Telemetry:
         time_ns = stamp_ns + best[0] if best is not None else stamp_ns
         if by_boot and self._unconfirmed_after_ns is not None and time_ns > self._unconfirmed_after_ns:
             return self._unknown(stamp_ns)
+        flags, ratio = self._estimator_at(stamp_ns)
         attitude, interpolated = self._attitude_at(time_ns, by_boot)
         position, velocity, epoch = self._local_at(time_ns, by_boot)
         odometry, odometry_epoch = self._odometry_at(time_ns, by_boot)
@@ -232,14 +236,15 @@ class Telemetry:
             landed=self._landed,
             synchronised=by_boot,
             sync_uncertainty_ns=best[1] if best is not None else None,
-            estimator_flags=self._estimator[0] if self._estimator else None,
-            position_test_ratio=self._estimator[1] if self._estimator else None,
+            estimator_flags=flags,
+            position_test_ratio=ratio,
             ned_from_gimbal=None if gimbal is None else gimbal.ned_from_gimbal,
             gimbal_sigma_rad=0.0 if gimbal is None else gimbal.sigma_rad,
         )
 
     def _unknown(self, stamp_ns: int) -> AutopilotState:
         """While it is open what time the autopilot's stamps mean."""
+        flags, ratio = self._estimator_at(stamp_ns)
         return AutopilotState(
             stamp_ns=stamp_ns,
             ned_from_body=None,
@@ -255,9 +260,15 @@ class Telemetry:
             landed=self._landed,
             synchronised=False,
             sync_uncertainty_ns=None,
-            estimator_flags=self._estimator[0] if self._estimator else None,
-            position_test_ratio=self._estimator[1] if self._estimator else None,
+            estimator_flags=flags,
+            position_test_ratio=ratio,
         )
+
+    def _estimator_at(self, stamp_ns: int) -> tuple[int, float] | tuple[None, None]:
+        """Flags and test ratio of the last report, while it is fresh."""
+        if self._estimator is None or stamp_ns - self._estimator[0] > _ESTIMATOR_FRESH_NS:
+            return None, None
+        return self._estimator[1:]
 
     # -- in --------------------
 
@@ -474,10 +485,10 @@ class Telemetry:
         self._landed = None if m.landed_state == undefined else m.landed_state == on_ground
 
     def _on_ekf_status(self, m: MavlinkMessage, arrival_ns: int) -> None:
-        self._estimator = (m.flags, float(m.pos_horiz_variance))
+        self._estimator = (arrival_ns, m.flags, float(m.pos_horiz_variance))
 
     def _on_estimator_status(self, m: MavlinkMessage, arrival_ns: int) -> None:
-        self._estimator = (m.flags, float(m.pos_horiz_ratio))
+        self._estimator = (arrival_ns, m.flags, float(m.pos_horiz_ratio))
 
     def _on_gimbal(self, m: MavlinkMessage, arrival_ns: int) -> None:
         assert self.gimbal is not None

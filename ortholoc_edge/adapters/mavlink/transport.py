@@ -15,6 +15,12 @@ from ortholoc_edge.adapters.mavlink.options import Endpoint
 _OUT_LIMIT_BYTES = 2048
 
 
+# What is taken in before something is said again: some 35 ms of work if all of it is hostile. A line of 3 Mbaud brings
+# as much in 14 ms.
+_IN_LIMIT_BYTES = 4096
+_IN_LIMIT_DATAGRAMS = 64
+
+
 class Transport(Protocol):
     """Non-blocking bytes. Every method may raise OSError, after which the transport is closed and opened
     anew."""
@@ -64,10 +70,15 @@ class _Udp:
 
     def receive(self) -> list[tuple[bytes, Any]]:
         got: list[tuple[bytes, Any]] = []
-        # Bounded, so that a flood leaves time to send.
-        for _ in range(64):
+        size = 0
+        # Bounded, so that a flood leaves time to speak; the rest waits in the socket, and select tells of it at once.
+        while size < _IN_LIMIT_BYTES and len(got) < _IN_LIMIT_DATAGRAMS:
             try:
-                got.append(self._socket.recvfrom(65535))
+                data, peer = self._socket.recvfrom(65535)
+                # A datagram holds a frame or a few. One longer than any router makes is cut: nobody's message is lost
+                # by that, and what waits behind it is heard the sooner.
+                got.append((data[:_IN_LIMIT_BYTES], peer))
+                size += len(data)
             except (BlockingIOError, InterruptedError):
                 break
             except ConnectionRefusedError:
@@ -120,7 +131,7 @@ class _ByteStream:
 
     def receive(self) -> list[tuple[bytes, Any]]:
         try:
-            data = os.read(self._device.fileno(), 65536)
+            data = os.read(self._device.fileno(), _IN_LIMIT_BYTES)
         except (BlockingIOError, InterruptedError):
             return []
         if not data:
