@@ -228,8 +228,18 @@ def test_gps_input_needs_an_instance_and_no_velocity():
     newer = {k: v for k, v in ARDUPILOT_STOCK.items() if not k.startswith("GPS_")} | {"GPS1_TYPE": 1, "GPS2_TYPE": 0}
     findings = audit(situation(newer, sinks=("gps_input",), version=(4, 6, 0)))
     assert ("GPS2_TYPE", 14) in {f.change for f in findings}
-    good = {**ARDUPILOT_STOCK, "GPS_TYPE": 14, "EK3_SRC1_VELXY": 0}
+    good = {**ARDUPILOT_STOCK, "GPS_TYPE2": 14, "EK3_SRC1_VELXY": 0}
     assert audit(situation(good, sinks=("gps_input",))) == []
+
+
+def test_gps_inputs_type_is_that_of_the_instance_addressed():
+    first = {**ARDUPILOT_STOCK, "GPS_TYPE": 14, "EK3_SRC1_VELXY": 0}
+    assert audit(situation(first, sinks=("gps_input",), gps_id=0)) == []
+    (finding,) = audit(situation(first, sinks=("gps_input",)))
+    assert finding.change == ("GPS_TYPE2", 14) and "gps_id = 1" in finding.why
+    alone = {k: v for k, v in first.items() if k != "GPS_TYPE2"}
+    (finding,) = audit(situation(alone, sinks=("gps_input",)))
+    assert finding.level is Level.ERROR and finding.change is None and "[link] gps_id" in finding.remedy
 
 
 def test_auxiliary_position_needs_a_slot_with_our_id():

@@ -171,6 +171,14 @@ def test_gps_input_is_a_receiver_without_velocity_and_knows_the_week():
     assert (m.hdop, m.vdop) == pytest.approx((2 / 3, 4 / 3))
 
 
+@pytest.mark.parametrize(("options", "gps_id"), [({}, 1), ({"gps_id": 0}, 0)])
+def test_gps_input_addresses_the_second_receiver_unless_told_otherwise(options, gps_id):
+    made, _ = outlet(send=("gps_input",), **options)
+    said = estimate()
+    (message,) = made.encode(said, ARDUPILOT, ORIGIN, said.stamp_ns, WALL_NS, recovery=False)
+    assert over_the_wire(message).gps_id == gps_id
+
+
 @pytest.mark.parametrize("unix_s", [0, 86_400, 1_700_000_000, 4_000_000_000])
 def test_gps_input_without_a_date_is_refused(unix_s):
     said = estimate()

@@ -72,7 +72,8 @@ NOTES = """
 - **MAV_CMD_EXTERNAL_POSITION_ESTIMATE** (`[link] recovery = true`) goes ahead of the first estimate after an outage, as
   ArduPilot takes it only while it has fused no position for a second, and PX4 only while it dead reckons.
 - **GPS_INPUT** needs the date. While the system clock is not between 2026 and 2076 it is refused. A step of that clock
-  is a step of its stamps; ArduPilot then takes up to 100 messages to find the delay again.
+  is a step of its stamps; ArduPilot then takes up to 100 messages to find the delay again. It is for one GPS instance,
+  `[link] gps_id` (1 unless set: the second, GPS2_TYPE 14); ArduPilot drops what is for another without a word.
 - **VISION_POSITION_ESTIMATE** has no quality: with VISO_QUAL_MIN or EKF2_EV_QMIN above 0 it is dropped.
 """
 

@@ -270,6 +270,13 @@ def test_the_commands_coarse_time_is_never_ahead(uptime_s):
         assert math.isnan(command.z)
 
 
+def test_gps_input_for_another_instance_is_dropped():
+    row = Row(Autopilot.ARDUPILOT, (4, 6, 3), Sink.GPS_INPUT)
+    assert heard(row, row.oracle((4, 6, 3), gps_instance=0), estimate(Autopilot.ARDUPILOT)) == Dropped(
+        "gps_id 1 is not this instance"
+    )
+
+
 def test_jitter_correction_forgets_after_a_hundred():
     jitter = JitterCorrection()
     assert jitter.correct_us(1_000_000, 1_050_000) == 1_050_000

@@ -75,7 +75,7 @@ class Situation:
     Attributes:
         autopilot: None while none was found.
         sinks: names of the messages that carry our estimates, as in ``[link] send``.
-        sensor_id: ours in GLOBAL_POSITION_SENSOR.
+        sensor_id: ours in GLOBAL_POSITION_SENSOR. gps_id: ours in GPS_INPUT.
         lever_arm_m: ``[mount] lever_arm_m``, which we take off ourselves; None if it isn't known.
         ages: of estimates when they arrive; None if that isn't known.
         baud: of our serial line; None for a network.
@@ -88,6 +88,7 @@ class Situation:
     health: LinkHealth
     readings: Mapping[str, Reading]
     sensor_id: int = 1
+    gps_id: int = 1
     lever_arm_m: tuple[float, float, float] | None = None
     ages: Ages | None = None
     baud: int | None = None
@@ -525,12 +526,19 @@ def _switching(situation: Situation) -> Iterator[Finding]:
 
 
 def _gps_types(situation: Situation) -> Iterator[Finding]:
-    names = [name for name in _GPS_TYPES if situation.value(name) is not None]
-    if names and all(situation.value(name) != 14 for name in names):
-        # The second one, so that a receiver in the first place stays.
-        yield from _setting(
-            situation, Level.ERROR, names[-1], 14, "no GPS instance takes GPS_INPUT (14, MAV)", reboot=True
-        )
+    names = _GPS_TYPES[situation.gps_id]
+    if all(situation.absent(name) for name in names):
+        yield Finding(
+            Level.ERROR, names[-1], "this firmware has none", "14",
+            f"it has no GPS instance {situation.gps_id}, to which our GPS_INPUT is addressed",
+            "install a firmware with two GPS instances, or set [link] gps_id to one that there is",
+        )  # fmt: skip
+    for name in names:
+        yield from _expect(
+            situation, Level.ERROR, name, 14,
+            f"GPS_INPUT is taken by type 14 (MAV) only, and [link] gps_id = {situation.gps_id} addresses this instance",
+            reboot=True,
+        )  # fmt: skip
 
 
 def _gps_sources(situation: Situation) -> Iterator[Finding]:
@@ -722,8 +730,8 @@ def _px4_port(situation: Situation) -> Iterator[Finding]:
 
 _A, _P = Autopilot.ARDUPILOT, Autopilot.PX4
 _RC_OPTIONS = tuple(f"RC{n}_OPTION" for n in range(5, 17))
-# Two names each: up to 4.5, and from 4.6.
-_GPS_TYPES = ("GPS_TYPE", "GPS1_TYPE", "GPS_TYPE2", "GPS2_TYPE")
+# By instance, two names each: up to 4.5, and from 4.6.
+_GPS_TYPES = (("GPS_TYPE", "GPS1_TYPE"), ("GPS_TYPE2", "GPS2_TYPE"))
 _SERIAL_PROTOCOLS = tuple(f"SERIAL{n}_PROTOCOL" for n in range(1, 8))
 _SERIAL_BAUDS = tuple(f"SERIAL{n}_BAUD" for n in range(1, 8))
 _PX4_BAUDS = ("SER_TEL1_BAUD", "SER_TEL2_BAUD", "SER_TEL3_BAUD")
@@ -752,7 +760,7 @@ _RULES = (
     _Rule(_viso_noise, ("VISO_QUAL_MIN", "VISO_POS_M_NSE"), _A, LOCAL),
     _Rule(_gates, ("EK3_POS_I_GATE", "EK3_GLITCH_RAD"), _A),
     _Rule(_switching, _RC_OPTIONS, _A, LOCAL),
-    _Rule(_gps_types, _GPS_TYPES, _A, _GPS),
+    _Rule(_gps_types, (*_GPS_TYPES[0], *_GPS_TYPES[1]), _A, _GPS),
     _Rule(_gps_sources, _SOURCES, _A, _GPS),
     _Rule(_ev_ctrl, ("EKF2_EV_CTRL",), _P, LOCAL),
     _Rule(_ev_delay, ("EKF2_EV_DELAY",), _P, LOCAL),

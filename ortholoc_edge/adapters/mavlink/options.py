@@ -44,6 +44,8 @@ class LinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         component_id: 197 is MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY.
         send: which messages carry an estimate; "auto" alone takes the best that the autopilot's firmware reads.
         sensor_id: ours in GLOBAL_POSITION_SENSOR; PX4 wants it in EKF2_AGPn_ID.
+        gps_id: the receiver that we pretend to be in GPS_INPUT: 0 is ArduPilot's GPS1_TYPE, 1 its GPS2_TYPE, which must
+            be 14. Another instance drops the message silently.
         recovery: whether the first fix after an outage also goes as MAV_CMD_EXTERNAL_POSITION_ESTIMATE, by which a
             filter that dead reckons sets its position to ours at once.
         autopilot: overrides what the heartbeat says.
@@ -74,6 +76,7 @@ class LinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         Literal["auto", "odometry", "vision_position_estimate", "global_position_sensor", "gps_input"], ...
     ] = ("auto",)
     sensor_id: Annotated[int, msgspec.Meta(ge=1, le=255)] = 1
+    gps_id: Annotated[int, msgspec.Meta(ge=0, le=1)] = 1
     recovery: bool = False
     autopilot: Literal["auto", "ardupilot", "px4"] = "auto"
     attitude_rate_hz: Annotated[float, msgspec.Meta(ge=1, le=400)] = 50.0

@@ -81,8 +81,9 @@ class Outlet:
         sinks = self.sinks(vehicle)
         # A stream that counts from the capture makes the command do so, too.
         capture_stamps = any(sink.local for sink in sinks)
-        sending = Sending(vehicle, now_ns, wall_ns, capture_stamps, self._options.sensor_id)
-        if recovery and self._options.recovery and self._recovers(vehicle):
+        options = self._options
+        sending = Sending(vehicle, now_ns, wall_ns, capture_stamps, options.sensor_id, options.gps_id)
+        if recovery and options.recovery and self._recovers(vehicle):
             sinks = (Sink.EXTERNAL_POSITION_ESTIMATE, *sinks)
         messages = []
         for sink in sinks:

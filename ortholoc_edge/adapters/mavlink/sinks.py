@@ -137,6 +137,7 @@ class Sending:
             message stamped at transmission would take the constant latency out of that offset, and
             VISO_DELAY_MS would count it twice for the next hundred messages.
         sensor_id: ``id`` of GLOBAL_POSITION_SENSOR.
+        gps_id: of GPS_INPUT: which of ArduPilot's GPS instances takes it, from 0.
     """
 
     vehicle: AutopilotIdentity
@@ -144,6 +145,7 @@ class Sending:
     wall_ns: int = 0
     capture_stamps: bool = False
     sensor_id: int = 1
+    gps_id: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -414,7 +416,7 @@ def encode_gps_input(estimate: VisionEstimate, place: Place, sending: Sending) -
     horizontal_m, vertical_m = horizontal_sigma_m(estimate), vertical_sigma_m(estimate)
     return dialect.MAVLink_gps_input_message(
         time_usec=estimate.stamp_ns // 1000,
-        gps_id=0,
+        gps_id=sending.gps_id,
         ignore_flags=dialect.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ
         | dialect.GPS_INPUT_IGNORE_FLAG_VEL_VERT
         | dialect.GPS_INPUT_IGNORE_FLAG_SPEED_ACCURACY,
