@@ -669,7 +669,7 @@ def test_origin_is_offered_only_where_there_is_none():
     for allowed in (False, True):
         script = Script(set_origin=allowed)
         script.protocol.offer_origin(origin)
-        script.run(4.0)
+        script.run(7.0)
         sent = [m for m in script.said if m.get_type() == "SET_GPS_GLOBAL_ORIGIN"]
         assert bool(sent) is allowed
     assert (sent[0].latitude, sent[0].longitude, sent[0].altitude) == (507000000, 71000000, 60000)
@@ -686,6 +686,40 @@ def test_origin_is_offered_only_where_there_is_none():
     assert script.protocol.state_at(script.now).local_epoch == state.local_epoch + 1
     script.hear(dialect.MAVLink_gps_global_origin_message(2**31 - 1, 0, 0))
     assert script.protocol.state_at(script.now).origin.longitude_deg == 7.20001
+
+
+def origins_set(script: Script) -> list:
+    return [m for m in script.said if m.get_type() == "SET_GPS_GLOBAL_ORIGIN"]
+
+
+def test_an_origin_is_set_only_after_three_questions_that_an_autopilot_left_open():
+    script = Script(set_origin=True)
+    script.protocol.offer_origin(GeodeticOrigin(50.0, 8.0, 100.0))
+    script.run(10.0)
+    named = [m.get_type() if m.get_type() != "COMMAND_LONG" else (m.command, m.param1) for m in script.said]
+    first = named.index("SET_GPS_GLOBAL_ORIGIN")
+    assert named[:first].count((512, 49.0)) >= 4  # three left open, and the one that it goes along with
+    # Heartbeats alone are no answer: the questions may be lost.
+    deaf = Script(set_origin=True)
+    deaf.protocol.offer_origin(GeodeticOrigin(50.0, 8.0, 100.0))
+    deaf.run(20.0, answer_timesync=False)
+    assert deaf.commands(512).count(49) >= 15 and not origins_set(deaf)
+
+
+def test_an_origin_of_before_a_restart_is_not_set():
+    script = Script(set_origin=True)
+    script.protocol.offer_origin(GeodeticOrigin(50.0, 8.0, 100.0))
+    script.run(1.5)
+    script.hear(dialect.MAVLink_gps_global_origin_message(507000000, 72000000, 60000))
+    script.hear(dialect.MAVLink_system_time_message(0, script.boot_ms()))
+    script.offset_ns = -script.now
+    script.hear(dialect.MAVLink_system_time_message(0, 0))
+    assert script.protocol.state_at(script.now).origin is None
+    script.run(12.0)
+    assert not origins_set(script)
+    script.protocol.offer_origin(GeodeticOrigin(50.1, 8.1, 100.0))
+    script.run(12.0)
+    assert {(m.latitude, m.longitude) for m in origins_set(script)} == {(501000000, 81000000)}
 
 
 def version(major: int, minor: int):

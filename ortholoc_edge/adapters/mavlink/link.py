@@ -316,7 +316,8 @@ class AutopilotLink:
     def offer_origin(self, origin: GeodeticOrigin) -> None:
         """Set the EKF origin if the autopilot turns out to have none and ``options.set_origin`` allows it.
 
-        Repeated until the autopilot tells an origin. That one counts, whether it is ours or not.
+        That is so once it answered other things, but three questions for its origin not. Repeated until it tells one,
+        which then counts, whether it is ours or not. Forgotten when the autopilot restarts.
         """
         with self._lock:
             self._protocol.offer_origin(origin)

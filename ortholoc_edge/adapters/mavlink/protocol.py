@@ -42,6 +42,9 @@ _AUTOPILOTS = {
 
 # An autopilot sends HEARTBEAT at 1 Hz; three missing is how ground stations judge it too.
 _SILENT_AFTER_NS = 3 * _S
+# An autopilot that answers other things, but this many questions for its origin in a row not, has none. One may be lost,
+# and ours must not replace an origin that is there.
+_ORIGIN_QUESTIONS = 3
 
 # The same text is logged once in this time; of this many texts it is known when that was.
 _TEXT_AGAIN_NS = 10 * _S
@@ -90,6 +93,8 @@ class LinkProtocol:
         # Other autopilots' system ids, each with when it was heard last.
         self._others: dict[int, int] = {}
         self._offered_origin: GeodeticOrigin | None = None
+        self._origin_unanswered = 0
+        self._answers_since = False
         self._home_known = False
         self._streams: dict[str, Stream] = {}
         self._heartbeat_timer = Repeat(1 * _S)
@@ -174,6 +179,8 @@ class LinkProtocol:
         restart = self.telemetry.take(message, arrival_ns)
         if restart is not None:
             self._start_over(restart, arrival_ns)
+        # Not the origin itself, which would have ended the questions.
+        self._answers_since |= name in ("TIMESYNC", "COMMAND_ACK", "AUTOPILOT_VERSION", "PARAM_VALUE")
         handler = self._handlers.get(name)
         if handler is not None:
             handler(message, arrival_ns)
@@ -254,6 +261,9 @@ class LinkProtocol:
         self._log(now_ns, logging.WARNING, "restart", f"autopilot: {why}; asking for its streams again")
         self.timesync.reset()
         self._home_known = False
+        # The one offered before is that of a life before; the next fix brings another.
+        self._offered_origin = None
+        self._origin_unanswered, self._answers_since = 0, False
         if self._vehicle is not None:
             self._vehicle = AutopilotIdentity(self._vehicle.system_id, self._vehicle.autopilot, None)
         for stream in self._streams.values():
@@ -355,10 +365,7 @@ class LinkProtocol:
         elif self._version_timer.due(now_ns):
             out.append(self._request(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION))
         if (self._origin_timer if self.telemetry.origin is None else self._origin_watch_timer).due(now_ns):
-            out.append(self._request(dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN))
-            if self.telemetry.origin is None and self._offered_origin is not None and self._options.set_origin:
-                # Lost before the filter has started, so it goes along with the question until answered.
-                out.append(self._set_origin(vehicle.system_id, self._offered_origin))
+            out += self._ask_origin(vehicle.system_id)
         if not self._home_known and self._home_timer.due(now_ns):
             out.append(self._request(dialect.MAVLINK_MSG_ID_HOME_POSITION))
         out += self._about_us(now_ns)
@@ -374,6 +381,19 @@ class LinkProtocol:
                 for component, message_id, interval_ns in self.telemetry.gimbal.requests(now_ns)
             ]
         out += self.parameters.poll(now_ns, vehicle.system_id, vehicle.autopilot)
+        return out
+
+    def _ask_origin(self, system_id: int) -> list[MavlinkMessage]:
+        """The question for the origin, and after it ours where there is none and we may set it."""
+        out = [self._request(dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)]
+        if self.telemetry.origin is not None:
+            return out
+        self._origin_unanswered += self._answers_since
+        self._answers_since = False
+        offered = self._offered_origin if self._options.set_origin else None
+        if offered is not None and self._origin_unanswered >= _ORIGIN_QUESTIONS:
+            # Lost before the filter has started, so it goes along with each question until answered.
+            out.append(self._set_origin(system_id, offered))
         return out
 
     def _watch(self, autopilot: Autopilot, now_ns: int) -> list[MavlinkMessage]:
