@@ -194,8 +194,8 @@ def _print_situation(endpoint: str, situation: Situation) -> None:
     health = situation.health
     rows = [("link", endpoint), ("heard", ", ".join(_peers(situation)) or "nobody")]
     if health.vehicle is not None:
-        version = ".".join(map(str, situation.firmware)) if situation.firmware else "of unknown version"
-        rows.append(("autopilot", f"{health.vehicle.autopilot.value} {version}, system {health.vehicle.system_id}"))
+        vehicle = health.vehicle
+        rows.append(("autopilot", f"{vehicle.autopilot.value} {vehicle.firmware}, system {vehicle.system_id}"))
         round_trip = "no answer" if health.round_trip_ms is None else f"round trip {health.round_trip_ms:.1f} ms"
         rows.append(("clock", f"{round_trip}, {'' if health.synchronised else 'not '}synchronised"))
         for i, (name, wanted_hz) in enumerate(health.wanted_rates_hz.items()):
@@ -259,6 +259,7 @@ def _facts(endpoint: str, situation: Situation, findings: list[Finding], written
         "link": endpoint,
         "autopilot": None if situation.autopilot is None else situation.autopilot.value,
         "firmware": None if situation.firmware is None else ".".join(map(str, situation.firmware)),
+        "development_build": health.vehicle is not None and health.vehicle.development,
         "system_id": None if health.vehicle is None else health.vehicle.system_id,
         "connected": health.connected,
         "sinks": sorted(situation.sinks),

@@ -722,10 +722,24 @@ def test_an_origin_of_before_a_restart_is_not_set():
     assert {(m.latitude, m.longitude) for m in origins_set(script)} == {(501000000, 81000000)}
 
 
-def version(major: int, minor: int):
+def version(major: int, minor: int, kind: int = 255):
     return dialect.MAVLink_autopilot_version_message(
-        0, major << 24 | minor << 16, 0, 0, 0, [0] * 8, [0] * 8, [0] * 8, 0, 0, 0
+        0, major << 24 | minor << 16 | kind, 0, 0, 0, [0] * 8, [0] * 8, [0] * 8, 0, 0, 0
     )
+
+
+@pytest.mark.parametrize("kind", [0, 64, 128, 192])
+def test_the_kind_of_build_is_read_from_the_version(kind, caplog):
+    caplog.set_level("INFO")
+    script = Script()
+    script.run(1.5)
+    script.hear(version(4, 8, kind))
+    vehicle = script.protocol.vehicle
+    assert vehicle.firmware_version == (4, 8, 0) and vehicle.development and vehicle.release is None
+    assert "ardupilot 4.8.0 (dev build)" in caplog.text
+    assert script.protocol.statistics(script.now)["firmware"] == "4.8.0 (dev build)"
+    script.hear(version(4, 8))
+    assert script.protocol.vehicle.release == (4, 8, 0)
 
 
 def test_estimate_takes_the_form_the_firmware_reads():

@@ -61,6 +61,13 @@ def test_a_stock_ardupilot_is_read_and_left_alone(capsys: pytest.CaptureFixture[
     assert "2 errors" in text
 
 
+def test_a_development_build_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    with autopilot(ARDUPILOT_READY, version=(4, 8, 0), version_type=0) as (_, endpoint):
+        assert main(["doctor", "--link", endpoint]) == 0
+    text = capsys.readouterr().out
+    assert "ardupilot 4.8.0 (dev build), system 7" in text and "note     firmware: 4.8.0 (dev build)" in text
+
+
 def test_a_set_up_that_works_over_a_serial_line(capsys: pytest.CaptureFixture[str]) -> None:
     with autopilot(ARDUPILOT_READY, PtyWire(), slow={"VISO_TYPE": 2, "EK3_ENABLE": 1}) as (_, endpoint):
         assert main(["doctor", "--link", endpoint, "--latency-ms", "20"]) == 0

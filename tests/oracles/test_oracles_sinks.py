@@ -153,7 +153,7 @@ def test_what_is_known_to_be_read_is_read(row: Row):
 
 @pytest.mark.parametrize("row", ROWS, ids=str)
 def test_auto_takes_one_that_is_read(row: Row):
-    (sink,) = choose_sinks(("auto",), row.autopilot, row.version).sinks
+    (sink,) = choose_sinks(("auto",), row.vehicle).sinks
     assert replace(row, sink=sink) in READ
 
 

@@ -290,9 +290,11 @@ class LinkProtocol:
         if v == 0 or self._vehicle is None:
             return
         version = (v >> 24 & 255, v >> 16 & 255, v >> 8 & 255)
-        if self._vehicle.firmware_version != version:
-            self._vehicle = AutopilotIdentity(self._vehicle.system_id, self._vehicle.autopilot, version)
-            logger.info("autopilot's firmware: %s %d.%d.%d", self._vehicle.autopilot.value, *version)
+        development = v & 255 != dialect.FIRMWARE_VERSION_TYPE_OFFICIAL
+        known = AutopilotIdentity(self._vehicle.system_id, self._vehicle.autopilot, version, development)
+        if self._vehicle != known:
+            self._vehicle = known
+            logger.info("autopilot's firmware: %s %s", known.autopilot.value, known.firmware)
 
     def _on_status_text(self, m: MavlinkMessage, arrival_ns: int) -> None:
         level = logging.WARNING if m.severity <= Severity.ERROR else logging.INFO
@@ -541,7 +543,6 @@ class LinkProtocol:
         best = self.timesync.best(now_ns)
         round_trip = self.timesync.last_round_trip_ns
         vehicle = self._vehicle
-        version = vehicle.firmware_version if vehicle else None
         advice = self.delay_advice()
         return {
             **self.counts,
@@ -556,7 +557,7 @@ class LinkProtocol:
             "connected": self.connected(now_ns),
             "autopilot": vehicle.autopilot.value if vehicle else None,
             "vehicle_system_id": vehicle.system_id if vehicle else None,
-            "firmware": ".".join(map(str, version)) if version else None,
+            "firmware": vehicle.firmware if vehicle and vehicle.firmware_version else None,
             "gimbal": None if self.telemetry.gimbal is None else str(self.telemetry.gimbal),
             "origin_known": self.telemetry.origin is not None,
             "local_epoch": self.telemetry.local_epoch,
