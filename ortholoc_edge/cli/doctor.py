@@ -18,7 +18,6 @@ import msgspec
 from ortholoc_edge.adapters.mavlink import AutopilotLink, LinkOptions
 from ortholoc_edge.adapters.mavlink.audit import Finding, Level, Situation
 from ortholoc_edge.adapters.mavlink.checkup import Checkup
-from ortholoc_edge.adapters.mavlink.latency import Ages
 from ortholoc_edge.adapters.mavlink.parameters import Answer, Written
 from ortholoc_edge.adapters.mavlink.signing import beside
 from ortholoc_edge.cli.arguments import non_negative, positive
@@ -52,8 +51,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
                         "mount's lever arm")  # fmt: skip
     parser.add_argument("--system-id", type=_system_id, metavar="N", help="the autopilot's (default: of --config, or "
                         "the first autopilot heard)")  # fmt: skip
-    parser.add_argument("--latency-ms", type=non_negative, metavar="MS", help="measured, from mid-exposure to sending; "
-                        "the autopilot's delay parameters are held against it")  # fmt: skip
+    parser.add_argument("--latency-ms", type=non_negative, metavar="MS", help="what localizing takes, from "
+                        "mid-exposure until a fix is there, as the daemon measures it. The delay parameters are held "
+                        "against what [link] release makes of it: about 0 with fast-forward (also without --config), "
+                        "fixed_latency_ms with fixed-latency, this value with raw")  # fmt: skip
     parser.add_argument("--fix", action="store_true", help="set the parameters, after a question for each")
     parser.add_argument("--yes", action="store_true", help="with --fix: don't ask")
     parser.add_argument("--json", action="store_true", help="as JSON (default: text)")
@@ -86,7 +87,8 @@ def run(args: argparse.Namespace) -> int:
     checkup = Checkup(
         link, options,
         lever_arm_m=None if config is None else config.mount.lever_arm_m,
-        ages=lambda: _ages(args.latency_ms, None if config is None else link),
+        # Without either the autopilot may be right for a release that isn't known here.
+        ages=lambda: None if config is None and args.latency_ms is None else link.ages(args.latency_ms),
     )  # fmt: skip
     link.start(open_now=True)
     try:
@@ -111,13 +113,6 @@ def run(args: argparse.Namespace) -> int:
     finally:
         link.stop()
     return 1 if any(finding.level is not Level.NOTE for finding in findings) else 0
-
-
-def _ages(latency_ms: float | None, configured: AutopilotLink | None) -> Ages | None:
-    """As given; else what the daemon's configuration says of it, which is nothing for "raw"."""
-    if latency_ms is not None:
-        return Ages(latency_ms, latency_ms, latency_ms)
-    return None if configured is None else configured.ages()
 
 
 def _listen(link: AutopilotLink, checkup: Checkup, clock: SystemClock, timeout_s: float) -> None:

@@ -195,6 +195,13 @@ def test_delay_follows_the_measured_latency():
     assert unknown.level is Level.NOTE
 
 
+def test_half_a_round_trip_above_the_range_is_no_error():
+    """fixed_latency_ms is 250 unless set, which is also the end of the parameter's range."""
+    (finding,) = audit(situation(ARDUPILOT_READY, ages=aged(251.0)))
+    assert finding.change == ("VISO_DELAY_MS", 250)
+    assert audit(situation({**ARDUPILOT_READY, "VISO_DELAY_MS": 250}, ages=aged(251.0))) == []
+
+
 def test_px4_looks_back_as_far_as_the_latency():
     findings = audit(px4(PX4_READY, ages=aged(260.0)))
     assert [f.change for f in findings if f.change] == [("EKF2_DELAY_MAX", 310)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -83,9 +84,36 @@ def test_ardupilot_is_mended(capsys: pytest.CaptureFixture[str]) -> None:
     assert "VISO_TYPE = 1, read back" in text and "restart the autopilot for VISO_TYPE\n" in text
 
 
-def test_px4_is_mended_in_its_own_encoding(capsys: pytest.CaptureFixture[str]) -> None:
+def configured(folder: Path, **link: Any) -> str:
+    """The example's configuration with strings or numbers of [link] replaced."""
+    text = CONFIG.read_text(encoding="utf-8")
+    for name, value in link.items():
+        text, found = re.subn(rf'(?m)^{name} = (".*?"|[\d.]+)', f"{name} = {json.dumps(value)}", text)
+        assert found == 1
+    path = folder / "configured.toml"
+    path.write_text(text, encoding="utf-8")
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("release", "latency_ms", "viso_delay_ms"),
+    [("fast-forward", 150, 0), ("fixed-latency", 150, 250), ("raw", 150, 150), (None, 150, 0)],
+)
+def test_a_latency_counts_as_the_release_makes_of_it(
+    release: str | None, latency_ms: int, viso_delay_ms: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with autopilot({**ARDUPILOT_READY, "VISO_DELAY_MS": 200}) as (fake, endpoint):
+        command = ["doctor", "--link", endpoint, "--latency-ms", str(latency_ms), "--fix", "--yes"]
+        main(command if release is None else [*command, "--config", configured(tmp_path, release=release)])
+        # Half a round trip comes to it.
+        assert viso_delay_ms <= fake.parameters["VISO_DELAY_MS"] <= min(viso_delay_ms + 15, 250)
+    capsys.readouterr()
+
+
+def test_px4_is_mended_in_its_own_encoding(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = configured(tmp_path, release="raw")
     with autopilot(PX4_STOCK, autopilot=dialect.MAV_AUTOPILOT_PX4, version=(1, 14, 3)) as (fake, endpoint):
-        command = ["doctor", "--link", endpoint, "--latency-ms", "220", "--fix", "--yes", "--json"]
+        command = ["doctor", "--config", config, "--link", endpoint, "--latency-ms", "220", "--fix", "--yes", "--json"]
         assert main(command) == 0
         assert fake.parameters == {**PX4_STOCK, "EKF2_EV_CTRL": 1, "EKF2_HGT_REF": 0, "EKF2_DELAY_MAX": 270.0}
     facts = json.loads(capsys.readouterr().out)

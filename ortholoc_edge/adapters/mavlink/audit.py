@@ -167,16 +167,16 @@ def _delay(situation: Situation, name: str, most_ms: float, latency_ms: float | 
             "a constant delay is known to the filter by this parameter alone, and no measured latency was given",
             "measure it (the daemon reports it) and give it with --latency-ms",
         )  # fmt: skip
-    elif latency_ms > most_ms:
+    elif latency_ms > most_ms + _DELAY_SLACK_MS:
         yield Finding(
             Level.ERROR, name, f"{found:g}", f"{latency_ms:.0f}",
             f"fixes are {latency_ms:.0f} ms old when they are sent, and this parameter ends at {most_ms:g}: what is "
             "older is taken for newer than it is",
             "make the pipeline faster, or have fixes carried forward before they are sent",
         )  # fmt: skip
-    elif abs(found - latency_ms) > _DELAY_SLACK_MS:
+    elif abs(found - min(latency_ms, most_ms)) > _DELAY_SLACK_MS:
         yield from _setting(
-            situation, Level.WARNING, name, round(latency_ms),
+            situation, Level.WARNING, name, round(min(latency_ms, most_ms)),
             "a constant delay is known to the filter by this parameter alone: each 10 ms wrong are 0.2 m at 20 m/s",
             reboot=True,
         )  # fmt: skip

@@ -239,10 +239,14 @@ class AutopilotLink:
         with self._lock:
             return self._protocol.delay_advice()
 
-    def ages(self) -> Ages | None:
-        """How old estimates are when they arrive: known of the mode of release, or measured; None before that."""
+    def ages(self, latency_ms: float | None = None) -> Ages | None:
+        """How old estimates are when they arrive: known of the mode of release, or measured; None before that.
+
+        Args:
+            latency_ms: from mid-exposure until a fix is there to be sent, where it was measured elsewhere.
+        """
         with self._lock:
-            return self._protocol.ages()
+            return self._protocol.ages(latency_ms)
 
     def trouble(self) -> str | None:
         """Why nothing current is known of the vehicle, where the link is to blame; None where it is not."""

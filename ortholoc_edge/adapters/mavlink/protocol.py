@@ -441,10 +441,18 @@ class LinkProtocol:
             self.timesync.median_round_trip_ns,
         )  # fmt: skip
 
-    def ages(self) -> Ages | None:
-        """How old estimates arrive, by which the delay parameters are to be set; None while it must be measured."""
+    def ages(self, latency_ms: float | None = None) -> Ages | None:
+        """How old estimates arrive, by which the delay parameters are to be set; None while it must be measured.
+
+        Args:
+            latency_ms: from mid-exposure until a fix is there to be sent, instead of what was measured here.
+        """
+        meter = self.latency
+        if latency_ms is not None:
+            meter = LatencyMeter()
+            meter.add(round(latency_ms * _MS))
         return ages_of(
-            self.release.mode, self.latency, self._options.fixed_latency_ms, self.timesync.median_round_trip_ns
+            self.release.mode, meter, self._options.fixed_latency_ms, self.timesync.median_round_trip_ns
         )
 
     def _tell_delays(self) -> None:
