@@ -151,17 +151,26 @@ def _yes(finding: Finding) -> bool:
     return True
 
 
+def _not_known_disarmed(link: AutopilotLink, clock: SystemClock) -> str | None:
+    """Why parameters must not be set now; None where the vehicle is known to be disarmed."""
+    state = link.state_at(clock.now_ns())
+    if state is None or not link.connected():
+        return "whether the vehicle is armed is not known, for want of a heartbeat"
+    return "the vehicle is armed" if state.armed else None
+
+
 def _fix(
     link: AutopilotLink, clock: SystemClock, findings: list[Finding], ask: Callable[[Finding], bool]
 ) -> list[Written]:
-    state = link.state_at(clock.now_ns())
-    if state is not None and state.armed:
-        logger.error("the vehicle is armed; nothing is changed. Disarm it and run this again")
-        return []
     written: list[Written] = []
     for finding in findings:
         if finding.change is None or not ask(finding):
             continue
+        # After the question: it may have been armed while that waited for its answer.
+        why = _not_known_disarmed(link, clock)
+        if why is not None:
+            logger.error("%s; nothing %sis changed", why, "more " if written else "")
+            break
         name, value = finding.change
         try:
             link.write_parameter(name, value)

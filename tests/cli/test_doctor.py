@@ -6,7 +6,8 @@ import io
 import json
 import re
 import socket
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -145,6 +146,51 @@ def test_an_armed_vehicle_is_left_alone(caplog: pytest.LogCaptureFixture) -> Non
         assert main(["doctor", "--link", endpoint, "--fix", "--yes"]) == 1
         assert fake.got_counts["PARAM_SET"] == 0
     assert "armed; nothing is changed" in caplog.text
+
+
+class Answers:
+    """Standard input of somebody who answers yes, and does something before the given answer."""
+
+    def __init__(self, before: int, action: Callable[[], None]) -> None:
+        self.before, self.action, self.asked = before, action, 0
+
+    def readline(self) -> str:
+        self.asked += 1
+        if self.asked == self.before:
+            self.action()
+        return "y\n"
+
+
+@pytest.mark.parametrize("before", [1, 2])
+def test_a_vehicle_that_is_armed_before_the_answer_is_left_alone(
+    before: int, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with autopilot(ARDUPILOT_STOCK) as (fake, endpoint):
+
+        def arm() -> None:
+            fake.base_mode = dialect.MAV_MODE_FLAG_SAFETY_ARMED
+            time.sleep(0.6)  # its heartbeat comes five times a second
+
+        answers = Answers(before, arm)
+        monkeypatch.setattr("sys.stdin", answers)
+        assert main(["doctor", "--link", endpoint, "--fix"]) == 1
+        assert answers.asked == before and len(fake.parameters_set) == before - 1
+    assert "the vehicle is armed" in caplog.text
+
+
+def test_a_vehicle_that_fell_silent_is_left_alone(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with autopilot(ARDUPILOT_STOCK) as (fake, endpoint):
+
+        def fall_silent() -> None:
+            fake.mute = True
+            time.sleep(3.5)
+
+        monkeypatch.setattr("sys.stdin", Answers(1, fall_silent))
+        assert main(["doctor", "--link", endpoint, "--fix"]) == 1
+        assert fake.got_counts["PARAM_SET"] == 0
+    assert "not known" in caplog.text and "nothing is changed" in caplog.text
 
 
 def test_firmware_without_a_parameter_says_so_at_once(capsys: pytest.CaptureFixture[str]) -> None:
