@@ -317,7 +317,7 @@ def silent(**changes) -> Situation:
         ({"peers": (), "bad_bytes": 900}, "heartbeat", "baud rates"),
         ({"peers": (Peer(255, 190, None, "ground station"),)}, "heartbeat", "router"),
         ({"peers": (Peer(3, 1, "ardupilot", "plane"),), "wanted_system_id": 7}, "system id", "system_id = 3"),
-        ({"peers": (Peer(3, 1, "other", "plane"),)}, "autopilot", "derivative"),
+        ({"peers": (Peer(3, 1, "other", "plane"),)}, "autopilot", "derives from"),
     ],
 )
 def test_why_there_is_no_autopilot(changes, subject, text):

@@ -218,6 +218,21 @@ def test_ground_station_and_others_are_not_autopilots():
     assert script.protocol.vehicle.system_id == 3 and script.protocol.counts["other_vehicles"] == 1
 
 
+def test_a_derivative_is_served_where_it_is_said_what_it_derives_from(caplog):
+    script = Script()
+    script.hear(heartbeat(0))
+    assert script.protocol.vehicle is None
+    script = Script(autopilot=0)
+    script.protocol = LinkProtocol(LinkOptions(endpoint="udp:x:1", autopilot="px4"))
+    script.hear(heartbeat(8))
+    script.hear(heartbeat(0, kind=6))
+    script.hear(heartbeat(0), component=154)
+    assert script.protocol.vehicle is None
+    script.run(3.0)
+    assert script.protocol.vehicle.autopilot is Autopilot.PX4 and 230 in script.commands(511)
+    assert "MAV_AUTOPILOT 0, configured is px4" in caplog.text
+
+
 def test_other_system_id_than_configured_is_said(caplog):
     script = Script(system_id=5)
     for _ in range(8):

@@ -231,7 +231,7 @@ def _heartbeat(situation: Situation) -> Iterator[Finding]:
     elif any(peer.autopilot == "other" for peer in others):
         yield Finding(
             Level.ERROR, "autopilot", "neither ArduPilot nor PX4", "ardupilot or px4",
-            "its messages and parameters are not known", "set [link] autopilot if it is a derivative of one of them",
+            "its messages and parameters are not known", "set [link] autopilot to the one that it derives from, if so",
         )  # fmt: skip
     elif health.peers:
         heard = ", ".join(f"{peer.system_id}/{peer.component_id} ({peer.role})" for peer in health.peers)

@@ -192,20 +192,29 @@ class LinkProtocol:
         return (
             message.get_type() == "HEARTBEAT"
             and message.get_srcComponent() == _AUTOPILOT_COMPONENT
-            and message.autopilot in _AUTOPILOTS
-            and message.type != dialect.MAV_TYPE_GCS
+            and self._autopilot_of(message) is not None
             and self._options.system_id in (0, message.get_srcSystem())
         )
 
+    def _autopilot_of(self, heartbeat: MavlinkMessage) -> Autopilot | None:
+        """The autopilot that a heartbeat is of: as it says, or as configured; None if it is of none that we serve.
+
+        A derivative may have a number of its own. It is served only where somebody said what it derives from.
+        """
+        if heartbeat.type == dialect.MAV_TYPE_GCS or heartbeat.autopilot == dialect.MAV_AUTOPILOT_INVALID:
+            return None
+        said = _AUTOPILOTS.get(heartbeat.autopilot)
+        return said if self._options.autopilot == "auto" else Autopilot(self._options.autopilot)
+
     def _is_another_autopilot(self, message: MavlinkMessage) -> bool:
         return (
-            message.autopilot in _AUTOPILOTS
-            and message.type != dialect.MAV_TYPE_GCS
+            self._autopilot_of(message) is not None
             and self._options.system_id not in (0, message.get_srcSystem())
         )
 
     def _on_heartbeat(self, message: MavlinkMessage, system: int, arrival_ns: int) -> None:
-        if not self.is_vehicle_heartbeat(message):
+        autopilot = self._autopilot_of(message)
+        if autopilot is None or not self.is_vehicle_heartbeat(message):
             self.counts["ignored"] += 1
             if self._is_another_autopilot(message):
                 self._others[system] = arrival_ns
@@ -219,8 +228,7 @@ class LinkProtocol:
                 )
             return
         self.counts["received.HEARTBEAT"] += 1
-        said = _AUTOPILOTS[message.autopilot]
-        autopilot = said if self._options.autopilot == "auto" else Autopilot(self._options.autopilot)
+        said = _AUTOPILOTS.get(message.autopilot)
         known = self._vehicle
         if known is not None and system != known.system_id:
             # For the life of the process: where ours fell silent, another's attitude would be a neighbour's.
@@ -242,7 +250,8 @@ class LinkProtocol:
             self._streams = self._wanted_streams(autopilot)
             logger.info("autopilot found: %s, system %d", autopilot.value, system)
             if autopilot is not said:
-                logger.warning("autopilot says it is %s, configured is %s", said.value, autopilot.value)
+                name = f"of MAV_AUTOPILOT {message.autopilot}" if said is None else said.value
+                logger.warning("autopilot says it is %s, configured is %s", name, autopilot.value)
         elif self._silent:
             logger.info("autopilot is back")
         self._silent = False
