@@ -69,7 +69,8 @@ NOTES = """
 - **ArduPilot's height** from ODOMETRY, with EK3_SRC1_POSZ at 6, gets the horizontal sigma; leave it at 1 (barometer).
 - **Position and yaw of unknown ArduPilot versions** are encoded so that neither reading of the covariance field claims
   too little. So are those for builds that are not releases (dev, alpha, beta, rc: AUTOPILOT_VERSION tells), at any
-  version, since such a build may have what the release of its number has, or not. A PX4 build of that kind gets ODOMETRY.
+  version, since such a build may have what the release of its number has, or not. A PX4 build of that kind gets
+  ODOMETRY.
 - **MAV_CMD_EXTERNAL_POSITION_ESTIMATE** (`[link] recovery = true`) goes ahead of the first estimate after an outage, as
   ArduPilot takes it only while it has fused no position for a second, and PX4 only while it dead reckons.
 - **GPS_INPUT** needs the date. While the system clock is not between 2026 and 2076 it is refused. A step of that clock

@@ -365,17 +365,17 @@ def _firmware(situation: Situation) -> Iterator[Finding]:
             "AUTOPILOT_VERSION was not answered, and the meaning of covariances depends on the version",
             "check that a router passes COMMAND_LONG and AUTOPILOT_VERSION",
         )  # fmt: skip
-    elif situation.health.vehicle is not None and situation.health.vehicle.development:
-        yield Finding(
-            Level.NOTE, "firmware", situation.health.vehicle.firmware, "a release",
-            "a build between two releases may read covariances as either of them does, so ours are encoded for both, and "
-            "only what every version reads is sent unless [link] send names it",
-            "install a release, or leave it",
-        )  # fmt: skip
     elif situation.firmware < oldest:
         yield Finding(
             Level.WARNING, "firmware", ".".join(map(str, situation.firmware)), f"{text} or newer",
             "parameters and messages of older versions were not looked at", "update the autopilot",
+        )  # fmt: skip
+    if situation.health.vehicle is not None and situation.health.vehicle.development:
+        yield Finding(
+            Level.NOTE, "firmware", situation.health.vehicle.firmware, "a release",
+            "a build between two releases may read covariances as either of them does, so ours are encoded for both, "
+            "and only what every version reads is sent unless [link] send names it",
+            "install a release, or leave it",
         )  # fmt: skip
 
 

@@ -48,7 +48,8 @@ class LinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
             be 14. Another instance drops the message silently.
         recovery: whether the first fix after an outage also goes as MAV_CMD_EXTERNAL_POSITION_ESTIMATE, by which a
             filter that dead reckons sets its position to ours at once.
-        autopilot: overrides what the heartbeat says. A derivative with a MAV_AUTOPILOT of its own is served only with it.
+        autopilot: overrides what the heartbeat says. A derivative with a MAV_AUTOPILOT of its own is served only with
+            it.
         attitude_rate_hz, position_rate_hz: of ATTITUDE_QUATERNION and LOCAL_POSITION_NED, asked of the
             autopilot.
         set_origin: whether `AutopilotLink.offer_origin` may set the EKF origin of an autopilot that has none.

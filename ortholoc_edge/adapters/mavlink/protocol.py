@@ -42,8 +42,8 @@ _AUTOPILOTS = {
 
 # An autopilot sends HEARTBEAT at 1 Hz; three missing is how ground stations judge it too.
 _SILENT_AFTER_NS = 3 * _S
-# An autopilot that answers other things, but this many questions for its origin in a row not, has none. One may be lost,
-# and ours must not replace an origin that is there.
+# An autopilot that answers other things, but this many questions for its origin in a row not, has none. One may be
+# lost, and ours must not replace an origin that is there.
 _ORIGIN_QUESTIONS = 3
 
 # The same text is logged once in this time; of this many texts it is known when that was.

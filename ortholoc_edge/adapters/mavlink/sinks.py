@@ -200,7 +200,8 @@ def choose_sinks(send: tuple[str, ...], vehicle: AutopilotIdentity) -> Choice:
         elif version is None:
             why = f"{who}: every version reads it, and its position sigma is encoded so that none is too small"
         elif autopilot is Autopilot.PX4:
-            why = f"{who} reads GLOBAL_POSITION_SENSOR only since {'.'.join(map(str, PX4_GLOBAL_POSITION_SENSOR_SINCE))}"
+            since = ".".join(map(str, PX4_GLOBAL_POSITION_SENSOR_SINCE))
+            why = f"{who} reads GLOBAL_POSITION_SENSOR only since {since}"
         else:
             why = f"{who} reads it with position, attitude, covariance, quality and reset counter"
         return Choice((Sink.ODOMETRY,), why)
