@@ -263,6 +263,26 @@ def test_own_heartbeat_and_requests():
     assert 230 in px4.commands(511) and 193 not in px4.commands(511)
 
 
+@pytest.mark.parametrize(
+    ("endpoint", "system_id", "from_s"),
+    [
+        ("udp:x:1", 0, None),
+        ("udp:x:1", 9, 0),
+        ("udpout:x:1", 0, 0),
+        ("tcp:x:1", 0, 0),
+        ("serial:/dev/x:57600", 0, 5),
+    ],
+)
+def test_who_speaks_before_the_vehicle_is_known(endpoint, system_id, from_s):
+    """Ours would carry a system id that nobody has; but a router, or PX4 over USB, must hear us first."""
+    protocol = LinkProtocol(LinkOptions(endpoint=endpoint, system_id=system_id))
+    start = 1000 * S
+    beats = [t for t in range(20) if any(m.get_type() == "HEARTBEAT" for m in protocol.poll(start + t * S))]
+    assert beats == ([] if from_s is None else list(range(from_s, 20)))
+    protocol.on_message(received(heartbeat(), system=system_id or 7), start + 20 * S)
+    assert any(m.get_type() == "HEARTBEAT" for m in protocol.poll(start + 21 * S))
+
+
 def test_timesync_request_is_answered_at_once():
     script = Script()
     script.hear(heartbeat())

@@ -548,6 +548,8 @@ class AutopilotLink:
         if verdict is Verdict.TOO_OLD and not self._peer_is_vehicle:
             # Its clock catches up as soon as it hears a signed frame of ours, for which it must be spoken to.
             transport.prefer(peer)
+            with self._lock:
+                self._protocol.speaks_first = True
         return False
 
     def _retire(self, parser: FrameParser) -> None:

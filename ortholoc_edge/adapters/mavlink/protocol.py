@@ -15,7 +15,7 @@ from ortholoc_edge.adapters.mavlink.gimbal import GimbalSelection
 from ortholoc_edge.adapters.mavlink.latency import Ages, DelayAdvice, LatencyMeter, advise, ages_of
 from ortholoc_edge.adapters.mavlink.log import LimitedLog
 from ortholoc_edge.adapters.mavlink.monitor import FusionMonitor, FusionReport
-from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus
+from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus, parse_endpoint
 from ortholoc_edge.adapters.mavlink.outlet import Outlet
 from ortholoc_edge.adapters.mavlink.parameters import ParameterClient
 from ortholoc_edge.adapters.mavlink.release import MAX_AGE_MS, Outgoing, Release
@@ -42,6 +42,9 @@ _AUTOPILOTS = {
 
 # An autopilot sends HEARTBEAT at 1 Hz; three missing is how ground stations judge it too.
 _SILENT_AFTER_NS = 3 * _S
+# A serial line on which no autopilot was heard for this long: some begin to speak MAVLink only when they are spoken to
+# (PX4 over USB).
+_SPEAK_FIRST_AFTER_NS = 5 * _S
 # An autopilot that answers other things, but this many questions for its origin in a row not, has none. One may be
 # lost, and ours must not replace an origin that is there.
 _ORIGIN_QUESTIONS = 3
@@ -90,6 +93,11 @@ class LinkProtocol:
         self._vehicle: AutopilotIdentity | None = None
         self._heartbeat_ns = 0
         self._silent = False
+        # Ours would carry a system id that nobody has, were they sent before the vehicle's is known; but who connects out
+        # must speak first, as a router learns from it where we are.
+        self._endpoint_kind = parse_endpoint(options.endpoint).kind
+        self.speaks_first = options.system_id != 0 or self._endpoint_kind in ("udpout", "tcp")
+        self._first_poll_ns: int | None = None
         # Other autopilots' system ids, each with when it was heard last.
         self._others: dict[int, int] = {}
         self._offered_origin: GeodeticOrigin | None = None
@@ -341,7 +349,11 @@ class LinkProtocol:
     def poll(self, now_ns: int) -> list[MavlinkMessage]:
         """What is due now."""
         out: list[MavlinkMessage] = []
-        if self._heartbeat_timer.due(now_ns):
+        if self._first_poll_ns is None:
+            self._first_poll_ns = now_ns
+        if self._endpoint_kind == "serial" and now_ns - self._first_poll_ns >= _SPEAK_FIRST_AFTER_NS:
+            self.speaks_first = True
+        if (self._vehicle is not None or self.speaks_first) and self._heartbeat_timer.due(now_ns):
             out.append(
                 dialect.MAVLink_heartbeat_message(
                     type=dialect.MAV_TYPE_ONBOARD_CONTROLLER,
