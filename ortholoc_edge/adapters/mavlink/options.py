@@ -55,7 +55,7 @@ class LinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         set_origin: whether `AutopilotLink.offer_origin` may set the EKF origin of an autopilot that has none.
         release: how fixes go out (`release`): carried on to the moment of sending, several times each; each once at
             the same age; or each once as soon as it is there.
-        estimate_rate_hz: of "fast-forward"; 0 is the same as "raw". A serial line must have room for it (`bandwidth`).
+        estimate_rate_hz: of "fast-forward", which with 0 is "raw". A serial line must have room for it (`bandwidth`).
             max_repeat_s: how long it goes on without a new fix.
         fixed_latency_ms: the age of "fixed-latency".
         switch_sources: whether we may tell ArduPilot to take another source set (MAV_CMD_SET_EKF_SOURCE_SET) when
