@@ -42,8 +42,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "doctor",
         help="what is wrong with the autopilot's link and settings",
         description="Listens to the autopilot, reads the parameters that matter to vision, and prints what is wrong, "
-        "why, and the command that mends it; docs/autopilot.md explains them. Nothing is changed without --fix. Exit "
-        "status: 0 nothing wrong, 1 something is (notes don't count), 2 usage.",
+        "why, and the command that mends it; docs/autopilot.md explains them. No parameter is changed without "
+        "--fix; the autopilot is asked for streams of messages on this link (SET_MESSAGE_INTERVAL), as the daemon asks. "
+        "Exit status: 0 nothing wrong, 1 something is (notes don't count) or the link can't be opened, 2 usage, 78 the "
+        "configuration or the endpoint can't be used.",
     )
     parser.add_argument("--link", metavar="ENDPOINT", help="udp:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or "
                         "serial:/dev/ttyX:BAUD (default: of --config)")  # fmt: skip

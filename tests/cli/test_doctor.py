@@ -265,6 +265,13 @@ def test_usage(arguments: list[str], problem: str, capsys: pytest.CaptureFixture
     assert stop.value.code == 2 and problem in capsys.readouterr().err
 
 
+def test_help_names_every_exit_status_and_what_is_asked_of_the_autopilot(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["doctor", "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    assert "78 the configuration or the endpoint" in text and "SET_MESSAGE_INTERVAL" in text
+
+
 def test_endpoints_that_cannot_be_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--link", "carrier:pigeon"]) == 78
     assert main(["doctor", "--link", f"serial:{tmp_path}/none:57600"]) == 1
