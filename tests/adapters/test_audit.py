@@ -174,6 +174,16 @@ def test_a_vision_set_that_no_switch_reaches_is_noted():
     assert serious(findings) == [] and "source switch" in [f.subject for f in findings]
 
 
+def test_velocities_of_all_sets_are_noted_where_there_are_some():
+    stock = {**ARDUPILOT_READY, "EK3_SRC_OPTIONS": 3}
+    (finding,) = audit(situation(stock, ages=aged(10.0)))
+    assert (finding.level, finding.subject, finding.change) == (Level.NOTE, "EK3_SRC_OPTIONS", None)
+    assert finding.remedy == "param set EK3_SRC_OPTIONS 2"
+    without = {**stock, "EK3_SRC1_VELXY": 0}
+    assert audit(situation(without, ages=aged(10.0))) == []
+    assert audit(situation({**stock, "EK3_SRC_OPTIONS": 2}, ages=aged(10.0))) == []
+
+
 def test_gates_that_refuse_nothing_are_noted_not_changed():
     (finding,) = (f for f in audit(situation({**ARDUPILOT_READY, "EK3_GLITCH_RAD": 0})) if "GLITCH" in f.subject)
     assert finding.level is Level.NOTE and finding.change is None

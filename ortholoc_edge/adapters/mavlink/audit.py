@@ -521,6 +521,20 @@ def _vision_sources(situation: Situation) -> Iterator[Finding]:
             yield from _setting(situation, Level.WARNING, yaw, _COMPASS, "this heading needs GNSS")
 
 
+def _velocities(situation: Situation) -> Iterator[Finding]:
+    """EK3_SRC_OPTIONS bit 0, which is on in stock firmware."""
+    found = situation.value("EK3_SRC_OPTIONS")
+    gnss = [n for n in (1, 2, 3) if situation.value(f"EK3_SRC{n}_VELXY") == _GNSS]
+    if found is not None and int(found) & 1 and _vision_sets(situation) and gnss:
+        bits = int(found) & ~1
+        yield Finding(
+            Level.NOTE, "EK3_SRC_OPTIONS", f"{found:g}", f"{bits} where GNSS may be deceived",
+            "bit 0 fuses the velocities of all source sets: while a receiver has a fix its velocity also steers the set "
+            "for vision",
+            f"param set EK3_SRC_OPTIONS {bits}",
+        )  # fmt: skip
+
+
 def _switching(situation: Situation) -> Iterator[Finding]:
     sets = _vision_sets(situation)
     options = [situation.value(name) for name in _RC_OPTIONS]
@@ -761,6 +775,7 @@ _RULES = (
     _Rule(_ekf3, ("AHRS_EKF_TYPE", "EK3_ENABLE"), _A),
     _Rule(_viso_type, ("VISO_TYPE",), _A, LOCAL),
     _Rule(_vision_sources, _SOURCES, _A, LOCAL),
+    _Rule(_velocities, ("EK3_SRC_OPTIONS",), _A, LOCAL),
     _Rule(_viso_delay, ("VISO_DELAY_MS",), _A, LOCAL),
     _Rule(_viso_lever_arm, ("VISO_POS_X", "VISO_POS_Y", "VISO_POS_Z"), _A, LOCAL),
     _Rule(_viso_conversion, ("VISO_SCALE", "VISO_ORIENT"), _A, LOCAL),
