@@ -34,7 +34,6 @@ _POLL_S = 0.05
 _LISTEN_NS = 6 * _S
 # Three repetitions of setting, and as many of reading back.
 _WRITE_PATIENCE_S = 10.0
-_ADVICE = {Level.ERROR: "error", Level.WARNING: "warning", Level.NOTE: "note"}
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -43,7 +42,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="what is wrong with the autopilot's link and settings",
         description="Listens to the autopilot, reads the parameters that matter to vision, and prints what is wrong, "
         "why, and the command that mends it; docs/autopilot.md explains them. No parameter is changed without "
-        "--fix; the autopilot is asked for streams of messages on this link (SET_MESSAGE_INTERVAL), as the daemon asks. "
+        "--fix; the autopilot is asked for streams of messages on this link (SET_MESSAGE_INTERVAL), as by the daemon. "
         "Exit status: 0 nothing wrong, 1 something is (notes don't count) or the link can't be opened, 2 usage, 78 the "
         "configuration or the endpoint can't be used.",
     )
@@ -229,11 +228,11 @@ def _print_findings(findings: list[Finding]) -> None:
     print()
     for finding in findings:
         reboot = ", after a reboot" if finding.reboot else ""
-        print(f"{_ADVICE[finding.level]:<9}{finding.subject}: {finding.found}; wanted: {finding.wanted}{reboot}")
+        print(f"{finding.level:<9}{finding.subject}: {finding.found}; wanted: {finding.wanted}{reboot}")
         print(f"{'':<9}{finding.why}")
         print(f"{'':<9}{finding.remedy}")
     counts = [
-        f"{number} {_ADVICE[level]}{'' if number == 1 else 's'}"
+        f"{number} {level}{'' if number == 1 else 's'}"
         for level in Level
         if (number := sum(finding.level is level for finding in findings))
     ]

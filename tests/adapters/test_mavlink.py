@@ -251,11 +251,11 @@ def test_other_system_id_than_configured_is_said(caplog):
 
 def test_own_heartbeat_and_requests():
     script = Script()
-    script.protocol.system_status = SystemStatus.CRITICAL
+    script.protocol.system_status = SystemStatus.ACTIVE
     script.run(5.0)
     beats = [m for m in script.said if m.get_type() == "HEARTBEAT"]
     assert 5 <= len(beats) <= 6
-    assert (beats[0].type, beats[0].autopilot, beats[0].system_status) == (18, 8, 5)
+    assert (beats[0].type, beats[0].autopilot, beats[0].system_status) == (18, 8, 4)
     assert {31, 32, 24, 2, 245, 193} <= set(script.commands(511))
     assert {148, 49, 242} <= set(script.commands(512))
     px4 = Script(autopilot=12)

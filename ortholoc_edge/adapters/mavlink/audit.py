@@ -529,8 +529,8 @@ def _velocities(situation: Situation) -> Iterator[Finding]:
         bits = int(found) & ~1
         yield Finding(
             Level.NOTE, "EK3_SRC_OPTIONS", f"{found:g}", f"{bits} where GNSS may be deceived",
-            "bit 0 fuses the velocities of all source sets: while a receiver has a fix its velocity also steers the set "
-            "for vision",
+            "bit 0 fuses the velocities of all source sets: while a receiver has a fix its velocity also steers the "
+            "set for vision",
             f"param set EK3_SRC_OPTIONS {bits}",
         )  # fmt: skip
 

@@ -45,7 +45,7 @@ _TCP_SILENCE_NS = 10 * _S
 _BACKOFF_MIN_S, _BACKOFF_MAX_S = 0.5, 10.0
 _SELECT_TIMEOUT_S = 0.05
 _GIVE_UP_AFTER_ERRORS = 10
-_CARRY_ESTIMATES = {sink.value.upper() for sink in Sink}
+_CARRY_ESTIMATES = {sink.value.upper() for sink in Sink if sink is not Sink.EXTERNAL_POSITION_ESTIMATE}
 # For `sys.setswitchinterval`, by who owns the process: how long the link's thread waits at most for a thread that
 # computes in Python. By default 5 ms, each time that it comes back from the kernel.
 SWITCH_INTERVAL_S = 1e-4

@@ -18,7 +18,6 @@ class SystemStatus(IntEnum):
     BOOT = 1
     STANDBY = 3
     ACTIVE = 4
-    CRITICAL = 5
 
 
 class Severity(IntEnum):

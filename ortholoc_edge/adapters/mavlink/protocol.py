@@ -93,8 +93,8 @@ class LinkProtocol:
         self._vehicle: AutopilotIdentity | None = None
         self._heartbeat_ns = 0
         self._silent = False
-        # Ours would carry a system id that nobody has, were they sent before the vehicle's is known; but who connects out
-        # must speak first, as a router learns from it where we are.
+        # Ours would carry a system id that nobody has, were they sent before the vehicle's is known; but who connects
+        # out must speak first, as a router learns from it where we are.
         self._endpoint_kind = parse_endpoint(options.endpoint).kind
         self.speaks_first = options.system_id != 0 or self._endpoint_kind in ("udpout", "tcp")
         self._first_poll_ns: int | None = None
