@@ -346,14 +346,17 @@ class LinkProtocol:
 
     # -- out --------------------
 
-    def poll(self, now_ns: int) -> list[MavlinkMessage]:
-        """What is due now."""
-        out: list[MavlinkMessage] = []
+    def _may_speak(self, now_ns: int) -> bool:
         if self._first_poll_ns is None:
             self._first_poll_ns = now_ns
         if self._endpoint_kind == "serial" and now_ns - self._first_poll_ns >= _SPEAK_FIRST_AFTER_NS:
             self.speaks_first = True
-        if (self._vehicle is not None or self.speaks_first) and self._heartbeat_timer.due(now_ns):
+        return self._vehicle is not None or self.speaks_first
+
+    def poll(self, now_ns: int) -> list[MavlinkMessage]:
+        """What is due now."""
+        out: list[MavlinkMessage] = []
+        if self._may_speak(now_ns) and self._heartbeat_timer.due(now_ns):
             out.append(
                 dialect.MAVLink_heartbeat_message(
                     type=dialect.MAV_TYPE_ONBOARD_CONTROLLER,
