@@ -18,7 +18,6 @@ import msgspec
 from ortholoc_edge.adapters.mavlink import AutopilotLink, LinkOptions
 from ortholoc_edge.adapters.mavlink.audit import Finding, Level, Situation
 from ortholoc_edge.adapters.mavlink.checkup import Checkup
-from ortholoc_edge.adapters.mavlink.latency import Ages
 from ortholoc_edge.adapters.mavlink.parameters import Answer, Written
 from ortholoc_edge.adapters.mavlink.signing import beside
 from ortholoc_edge.cli.arguments import non_negative, positive
@@ -35,7 +34,6 @@ _POLL_S = 0.05
 _LISTEN_NS = 6 * _S
 # Three repetitions of setting, and as many of reading back.
 _WRITE_PATIENCE_S = 10.0
-_ADVICE = {Level.ERROR: "error", Level.WARNING: "warning", Level.NOTE: "note"}
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -43,8 +41,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "doctor",
         help="what is wrong with the autopilot's link and settings",
         description="Listens to the autopilot, reads the parameters that matter to vision, and prints what is wrong, "
-        "why, and the command that mends it; docs/autopilot.md explains them. Nothing is changed without --fix. Exit "
-        "status: 0 nothing wrong, 1 something is (notes don't count), 2 usage.",
+        "why, and the command that mends it; docs/autopilot.md explains them. No parameter is changed without "
+        "--fix; the autopilot is asked for streams of messages on this link (SET_MESSAGE_INTERVAL), as by the daemon. "
+        "Exit status: 0 nothing wrong, 1 something is (notes don't count) or the link can't be opened, 2 usage, 78 the "
+        "configuration or the endpoint can't be used.",
     )
     parser.add_argument("--link", metavar="ENDPOINT", help="udp:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or "
                         "serial:/dev/ttyX:BAUD (default: of --config)")  # fmt: skip
@@ -52,8 +52,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
                         "mount's lever arm")  # fmt: skip
     parser.add_argument("--system-id", type=_system_id, metavar="N", help="the autopilot's (default: of --config, or "
                         "the first autopilot heard)")  # fmt: skip
-    parser.add_argument("--latency-ms", type=non_negative, metavar="MS", help="measured, from mid-exposure to sending; "
-                        "the autopilot's delay parameters are held against it")  # fmt: skip
+    parser.add_argument("--latency-ms", type=non_negative, metavar="MS", help="what localizing takes, from "
+                        "mid-exposure until a fix is there, as the daemon measures it. The delay parameters are held "
+                        "against what [link] release makes of it: about 0 with fast-forward (also without --config), "
+                        "fixed_latency_ms with fixed-latency, this value with raw")  # fmt: skip
     parser.add_argument("--fix", action="store_true", help="set the parameters, after a question for each")
     parser.add_argument("--yes", action="store_true", help="with --fix: don't ask")
     parser.add_argument("--json", action="store_true", help="as JSON (default: text)")
@@ -86,7 +88,8 @@ def run(args: argparse.Namespace) -> int:
     checkup = Checkup(
         link, options,
         lever_arm_m=None if config is None else config.mount.lever_arm_m,
-        ages=lambda: _ages(args.latency_ms, None if config is None else link),
+        # Without either the autopilot may be right for a release that isn't known here.
+        ages=lambda: None if config is None and args.latency_ms is None else link.ages(args.latency_ms),
     )  # fmt: skip
     link.start(open_now=True)
     try:
@@ -111,13 +114,6 @@ def run(args: argparse.Namespace) -> int:
     finally:
         link.stop()
     return 1 if any(finding.level is not Level.NOTE for finding in findings) else 0
-
-
-def _ages(latency_ms: float | None, configured: AutopilotLink | None) -> Ages | None:
-    """As given; else what the daemon's configuration says of it, which is nothing for "raw"."""
-    if latency_ms is not None:
-        return Ages(latency_ms, latency_ms, latency_ms)
-    return None if configured is None else configured.ages()
 
 
 def _listen(link: AutopilotLink, checkup: Checkup, clock: SystemClock, timeout_s: float) -> None:
@@ -156,17 +152,26 @@ def _yes(finding: Finding) -> bool:
     return True
 
 
+def _not_known_disarmed(link: AutopilotLink, clock: SystemClock) -> str | None:
+    """Why parameters must not be set now; None where the vehicle is known to be disarmed."""
+    state = link.state_at(clock.now_ns())
+    if state is None or not link.connected():
+        return "whether the vehicle is armed is not known, for want of a heartbeat"
+    return "the vehicle is armed" if state.armed else None
+
+
 def _fix(
     link: AutopilotLink, clock: SystemClock, findings: list[Finding], ask: Callable[[Finding], bool]
 ) -> list[Written]:
-    state = link.state_at(clock.now_ns())
-    if state is not None and state.armed:
-        logger.error("the vehicle is armed; nothing is changed. Disarm it and run this again")
-        return []
     written: list[Written] = []
     for finding in findings:
         if finding.change is None or not ask(finding):
             continue
+        # After the question: it may have been armed while that waited for its answer.
+        why = _not_known_disarmed(link, clock)
+        if why is not None:
+            logger.error("%s; nothing %sis changed", why, "more " if written else "")
+            break
         name, value = finding.change
         try:
             link.write_parameter(name, value)
@@ -194,8 +199,8 @@ def _print_situation(endpoint: str, situation: Situation) -> None:
     health = situation.health
     rows = [("link", endpoint), ("heard", ", ".join(_peers(situation)) or "nobody")]
     if health.vehicle is not None:
-        version = ".".join(map(str, situation.firmware)) if situation.firmware else "of unknown version"
-        rows.append(("autopilot", f"{health.vehicle.autopilot.value} {version}, system {health.vehicle.system_id}"))
+        vehicle = health.vehicle
+        rows.append(("autopilot", f"{vehicle.autopilot.value} {vehicle.firmware}, system {vehicle.system_id}"))
         round_trip = "no answer" if health.round_trip_ms is None else f"round trip {health.round_trip_ms:.1f} ms"
         rows.append(("clock", f"{round_trip}, {'' if health.synchronised else 'not '}synchronised"))
         for i, (name, wanted_hz) in enumerate(health.wanted_rates_hz.items()):
@@ -223,11 +228,11 @@ def _print_findings(findings: list[Finding]) -> None:
     print()
     for finding in findings:
         reboot = ", after a reboot" if finding.reboot else ""
-        print(f"{_ADVICE[finding.level]:<9}{finding.subject}: {finding.found}; wanted: {finding.wanted}{reboot}")
+        print(f"{finding.level:<9}{finding.subject}: {finding.found}; wanted: {finding.wanted}{reboot}")
         print(f"{'':<9}{finding.why}")
         print(f"{'':<9}{finding.remedy}")
     counts = [
-        f"{number} {_ADVICE[level]}{'' if number == 1 else 's'}"
+        f"{number} {level}{'' if number == 1 else 's'}"
         for level in Level
         if (number := sum(finding.level is level for finding in findings))
     ]
@@ -259,6 +264,7 @@ def _facts(endpoint: str, situation: Situation, findings: list[Finding], written
         "link": endpoint,
         "autopilot": None if situation.autopilot is None else situation.autopilot.value,
         "firmware": None if situation.firmware is None else ".".join(map(str, situation.firmware)),
+        "development_build": health.vehicle is not None and health.vehicle.development,
         "system_id": None if health.vehicle is None else health.vehicle.system_id,
         "connected": health.connected,
         "sinks": sorted(situation.sinks),

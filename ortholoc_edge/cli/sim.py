@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from ortholoc_edge.bench.metrics import Spread
 from ortholoc_edge.cli import matcher_options
-from ortholoc_edge.cli.arguments import positive, seed, writable_folder
+from ortholoc_edge.cli.arguments import non_negative, positive, seed, writable_folder
 from ortholoc_edge.errors import ConfigError, OrtholocError
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
 from ortholoc_edge.tiles.pack import Pack
@@ -45,7 +45,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument(
         "--viso-delay-ms",
-        type=positive,
+        type=non_negative,
         default=10.0,
         metavar="MS",
         help="VISO_DELAY_MS of the autopilot, which has the time of a fix as ArduPilot has it: by the least delay seen "

@@ -155,6 +155,7 @@ class FakeAutopilot:
         self.nan_attitude = False
         self.mute = False
         self.yaw_rate = 0.4
+        self.version_type = 255  # FIRMWARE_VERSION_TYPE_OFFICIAL
         self.origin: tuple[int, int, int] | None = (507000000, 71000000, 60000)
         self.position_step = 0.0
         # Makes GIMBAL_DEVICE_ATTITUDE_STATUS of a boot time in ms; None: there is no gimbal.
@@ -335,5 +336,5 @@ class FakeAutopilot:
 
     def _version_message(self, boot_ms: int):
         major, minor, patch = self.version
-        word = major << 24 | minor << 16 | patch << 8 | 255
+        word = major << 24 | minor << 16 | patch << 8 | self.version_type
         return dialect.MAVLink_autopilot_version_message(0, word, 0, 0, 0, [0] * 8, [0] * 8, [0] * 8, 0, 0, 0)

@@ -6,6 +6,7 @@ ARDUPILOT_STOCK: dict[str, int | float] = {
     "EK3_ENABLE": 1,
     "EK3_GLITCH_RAD": 25,
     "EK3_POS_I_GATE": 500,
+    "EK3_SRC_OPTIONS": 1,
     "VISO_TYPE": 0,
     "VISO_DELAY_MS": 10,
     "VISO_POS_X": 0.0,
@@ -26,7 +27,7 @@ ARDUPILOT_STOCK: dict[str, int | float] = {
     **{f"SERIAL{n}_PROTOCOL": protocol for n, protocol in enumerate((2, 2, 5, 5, -1, -1, -1), start=1)},
     **{f"SERIAL{n}_BAUD": baud for n, baud in enumerate((57, 57, 38, 38, 57, 57, 57), start=1)},
 }
-ARDUPILOT_READY = {**ARDUPILOT_STOCK, "VISO_TYPE": 1, "EK3_SRC2_POSXY": 6, "RC8_OPTION": 90}
+ARDUPILOT_READY = {**ARDUPILOT_STOCK, "EK3_SRC_OPTIONS": 0, "VISO_TYPE": 1, "EK3_SRC2_POSXY": 6, "RC8_OPTION": 90}
 
 # PX4 1.14: external vision, the height reference is GNSS.
 PX4_STOCK: dict[str, int | float] = {

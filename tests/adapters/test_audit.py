@@ -174,6 +174,16 @@ def test_a_vision_set_that_no_switch_reaches_is_noted():
     assert serious(findings) == [] and "source switch" in [f.subject for f in findings]
 
 
+def test_velocities_of_all_sets_are_noted_where_there_are_some():
+    stock = {**ARDUPILOT_READY, "EK3_SRC_OPTIONS": 3}
+    (finding,) = audit(situation(stock, ages=aged(10.0)))
+    assert (finding.level, finding.subject, finding.change) == (Level.NOTE, "EK3_SRC_OPTIONS", None)
+    assert finding.remedy == "param set EK3_SRC_OPTIONS 2"
+    without = {**stock, "EK3_SRC1_VELXY": 0}
+    assert audit(situation(without, ages=aged(10.0))) == []
+    assert audit(situation({**stock, "EK3_SRC_OPTIONS": 2}, ages=aged(10.0))) == []
+
+
 def test_gates_that_refuse_nothing_are_noted_not_changed():
     (finding,) = (f for f in audit(situation({**ARDUPILOT_READY, "EK3_GLITCH_RAD": 0})) if "GLITCH" in f.subject)
     assert finding.level is Level.NOTE and finding.change is None
@@ -193,6 +203,13 @@ def test_delay_follows_the_measured_latency():
     assert late.level is Level.ERROR and late.change is None and "250" in late.why
     (unknown,) = at(None, 10)
     assert unknown.level is Level.NOTE
+
+
+def test_half_a_round_trip_above_the_range_is_no_error():
+    """fixed_latency_ms is 250 unless set, which is also the end of the parameter's range."""
+    (finding,) = audit(situation(ARDUPILOT_READY, ages=aged(251.0)))
+    assert finding.change == ("VISO_DELAY_MS", 250)
+    assert audit(situation({**ARDUPILOT_READY, "VISO_DELAY_MS": 250}, ages=aged(251.0))) == []
 
 
 def test_px4_looks_back_as_far_as_the_latency():
@@ -228,8 +245,18 @@ def test_gps_input_needs_an_instance_and_no_velocity():
     newer = {k: v for k, v in ARDUPILOT_STOCK.items() if not k.startswith("GPS_")} | {"GPS1_TYPE": 1, "GPS2_TYPE": 0}
     findings = audit(situation(newer, sinks=("gps_input",), version=(4, 6, 0)))
     assert ("GPS2_TYPE", 14) in {f.change for f in findings}
-    good = {**ARDUPILOT_STOCK, "GPS_TYPE": 14, "EK3_SRC1_VELXY": 0}
+    good = {**ARDUPILOT_STOCK, "GPS_TYPE2": 14, "EK3_SRC1_VELXY": 0}
     assert audit(situation(good, sinks=("gps_input",))) == []
+
+
+def test_gps_inputs_type_is_that_of_the_instance_addressed():
+    first = {**ARDUPILOT_STOCK, "GPS_TYPE": 14, "EK3_SRC1_VELXY": 0}
+    assert audit(situation(first, sinks=("gps_input",), gps_id=0)) == []
+    (finding,) = audit(situation(first, sinks=("gps_input",)))
+    assert finding.change == ("GPS_TYPE2", 14) and "gps_id = 1" in finding.why
+    alone = {k: v for k, v in first.items() if k != "GPS_TYPE2"}
+    (finding,) = audit(situation(alone, sinks=("gps_input",)))
+    assert finding.level is Level.ERROR and finding.change is None and "[link] gps_id" in finding.remedy
 
 
 def test_auxiliary_position_needs_a_slot_with_our_id():
@@ -300,7 +327,7 @@ def silent(**changes) -> Situation:
         ({"peers": (), "bad_bytes": 900}, "heartbeat", "baud rates"),
         ({"peers": (Peer(255, 190, None, "ground station"),)}, "heartbeat", "router"),
         ({"peers": (Peer(3, 1, "ardupilot", "plane"),), "wanted_system_id": 7}, "system id", "system_id = 3"),
-        ({"peers": (Peer(3, 1, "other", "plane"),)}, "autopilot", "derivative"),
+        ({"peers": (Peer(3, 1, "other", "plane"),)}, "autopilot", "derives from"),
     ],
 )
 def test_why_there_is_no_autopilot(changes, subject, text):

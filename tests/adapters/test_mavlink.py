@@ -218,6 +218,21 @@ def test_ground_station_and_others_are_not_autopilots():
     assert script.protocol.vehicle.system_id == 3 and script.protocol.counts["other_vehicles"] == 1
 
 
+def test_a_derivative_is_served_where_it_is_said_what_it_derives_from(caplog):
+    script = Script()
+    script.hear(heartbeat(0))
+    assert script.protocol.vehicle is None
+    script = Script(autopilot=0)
+    script.protocol = LinkProtocol(LinkOptions(endpoint="udp:x:1", autopilot="px4"))
+    script.hear(heartbeat(8))
+    script.hear(heartbeat(0, kind=6))
+    script.hear(heartbeat(0), component=154)
+    assert script.protocol.vehicle is None
+    script.run(3.0)
+    assert script.protocol.vehicle.autopilot is Autopilot.PX4 and 230 in script.commands(511)
+    assert "MAV_AUTOPILOT 0, configured is px4" in caplog.text
+
+
 def test_other_system_id_than_configured_is_said(caplog):
     script = Script(system_id=5)
     for _ in range(8):
@@ -236,16 +251,36 @@ def test_other_system_id_than_configured_is_said(caplog):
 
 def test_own_heartbeat_and_requests():
     script = Script()
-    script.protocol.system_status = SystemStatus.CRITICAL
+    script.protocol.system_status = SystemStatus.ACTIVE
     script.run(5.0)
     beats = [m for m in script.said if m.get_type() == "HEARTBEAT"]
     assert 5 <= len(beats) <= 6
-    assert (beats[0].type, beats[0].autopilot, beats[0].system_status) == (18, 8, 5)
+    assert (beats[0].type, beats[0].autopilot, beats[0].system_status) == (18, 8, 4)
     assert {31, 32, 24, 2, 245, 193} <= set(script.commands(511))
     assert {148, 49, 242} <= set(script.commands(512))
     px4 = Script(autopilot=12)
     px4.run(3.0)
     assert 230 in px4.commands(511) and 193 not in px4.commands(511)
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "system_id", "from_s"),
+    [
+        ("udp:x:1", 0, None),
+        ("udp:x:1", 9, 0),
+        ("udpout:x:1", 0, 0),
+        ("tcp:x:1", 0, 0),
+        ("serial:/dev/x:57600", 0, 5),
+    ],
+)
+def test_who_speaks_before_the_vehicle_is_known(endpoint, system_id, from_s):
+    """Ours would carry a system id that nobody has; but a router, or PX4 over USB, must hear us first."""
+    protocol = LinkProtocol(LinkOptions(endpoint=endpoint, system_id=system_id))
+    start = 1000 * S
+    beats = [t for t in range(20) if any(m.get_type() == "HEARTBEAT" for m in protocol.poll(start + t * S))]
+    assert beats == ([] if from_s is None else list(range(from_s, 20)))
+    protocol.on_message(received(heartbeat(), system=system_id or 7), start + 20 * S)
+    assert any(m.get_type() == "HEARTBEAT" for m in protocol.poll(start + 21 * S))
 
 
 def test_timesync_request_is_answered_at_once():
@@ -669,7 +704,7 @@ def test_origin_is_offered_only_where_there_is_none():
     for allowed in (False, True):
         script = Script(set_origin=allowed)
         script.protocol.offer_origin(origin)
-        script.run(4.0)
+        script.run(7.0)
         sent = [m for m in script.said if m.get_type() == "SET_GPS_GLOBAL_ORIGIN"]
         assert bool(sent) is allowed
     assert (sent[0].latitude, sent[0].longitude, sent[0].altitude) == (507000000, 71000000, 60000)
@@ -688,10 +723,58 @@ def test_origin_is_offered_only_where_there_is_none():
     assert script.protocol.state_at(script.now).origin.longitude_deg == 7.20001
 
 
-def version(major: int, minor: int):
+def origins_set(script: Script) -> list:
+    return [m for m in script.said if m.get_type() == "SET_GPS_GLOBAL_ORIGIN"]
+
+
+def test_an_origin_is_set_only_after_three_questions_that_an_autopilot_left_open():
+    script = Script(set_origin=True)
+    script.protocol.offer_origin(GeodeticOrigin(50.0, 8.0, 100.0))
+    script.run(10.0)
+    named = [m.get_type() if m.get_type() != "COMMAND_LONG" else (m.command, m.param1) for m in script.said]
+    first = named.index("SET_GPS_GLOBAL_ORIGIN")
+    assert named[:first].count((512, 49.0)) >= 4  # three left open, and the one that it goes along with
+    # Heartbeats alone are no answer: the questions may be lost.
+    deaf = Script(set_origin=True)
+    deaf.protocol.offer_origin(GeodeticOrigin(50.0, 8.0, 100.0))
+    deaf.run(20.0, answer_timesync=False)
+    assert deaf.commands(512).count(49) >= 15 and not origins_set(deaf)
+
+
+def test_an_origin_of_before_a_restart_is_not_set():
+    script = Script(set_origin=True)
+    script.protocol.offer_origin(GeodeticOrigin(50.0, 8.0, 100.0))
+    script.run(1.5)
+    script.hear(dialect.MAVLink_gps_global_origin_message(507000000, 72000000, 60000))
+    script.hear(dialect.MAVLink_system_time_message(0, script.boot_ms()))
+    script.offset_ns = -script.now
+    script.hear(dialect.MAVLink_system_time_message(0, 0))
+    assert script.protocol.state_at(script.now).origin is None
+    script.run(12.0)
+    assert not origins_set(script)
+    script.protocol.offer_origin(GeodeticOrigin(50.1, 8.1, 100.0))
+    script.run(12.0)
+    assert {(m.latitude, m.longitude) for m in origins_set(script)} == {(501000000, 81000000)}
+
+
+def version(major: int, minor: int, kind: int = 255):
     return dialect.MAVLink_autopilot_version_message(
-        0, major << 24 | minor << 16, 0, 0, 0, [0] * 8, [0] * 8, [0] * 8, 0, 0, 0
+        0, major << 24 | minor << 16 | kind, 0, 0, 0, [0] * 8, [0] * 8, [0] * 8, 0, 0, 0
     )
+
+
+@pytest.mark.parametrize("kind", [0, 64, 128, 192])
+def test_the_kind_of_build_is_read_from_the_version(kind, caplog):
+    caplog.set_level("INFO")
+    script = Script()
+    script.run(1.5)
+    script.hear(version(4, 8, kind))
+    vehicle = script.protocol.vehicle
+    assert vehicle.firmware_version == (4, 8, 0) and vehicle.development and vehicle.release is None
+    assert "ardupilot 4.8.0 (dev build)" in caplog.text
+    assert script.protocol.statistics(script.now)["firmware"] == "4.8.0 (dev build)"
+    script.hear(version(4, 8))
+    assert script.protocol.vehicle.release == (4, 8, 0)
 
 
 def test_estimate_takes_the_form_the_firmware_reads():

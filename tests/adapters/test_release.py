@@ -237,6 +237,10 @@ def test_fixed_latency_holds_each_fix_to_its_age():
     assert +release.counts == {"late_for_release": 1}
 
 
+def test_fixed_latency_has_no_rate():
+    assert make(release="fixed-latency", estimate_rate_hz=0.0).mode == "fixed-latency"
+
+
 @pytest.mark.parametrize("options", [{"release": "raw"}, {"estimate_rate_hz": 0.0}])
 def test_raw_is_each_fix_once_as_it_is(options):
     flight = Flight()

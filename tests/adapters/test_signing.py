@@ -57,7 +57,9 @@ def test_key_is_read_raw_or_in_digits(content, tmp_path):
 @pytest.mark.parametrize(
     ("content", "mode", "named"),
     [
-        (KEY, 0o644, "every user may read or write .*mode 644.*chmod 600"),
+        (KEY, 0o644, "others than its owner may read or write .*mode 644.*chmod 600"),
+        (KEY, 0o640, "others than its owner may read or write .*mode 640.*chmod 600"),
+        (KEY, 0o620, "others than its owner"),
         (KEY[:31], 0o600, "has 31 bytes; a key is 32 bytes, or 64 hexadecimal digits"),
         (KEY.hex().encode()[:-1] + b"g", 0o600, "has 64 bytes"),
         (b"", 0o600, "has 0 bytes"),
@@ -68,6 +70,19 @@ def test_unusable_key_is_refused_and_not_shown(content, mode, named, tmp_path):
     with pytest.raises(ConfigError, match=named) as refused:
         read_key(key_file(tmp_path, content, mode), {})
     assert KEY.hex()[:20] not in str(refused.value)
+
+
+def test_a_credentials_access_list_is_not_its_group(tmp_path):
+    key_file(tmp_path, mode=0o440)
+    assert read_key("mavlink.key", {"CREDENTIALS_DIRECTORY": str(tmp_path)}) == KEY
+    key_file(tmp_path, mode=0o644)
+    with pytest.raises(ConfigError, match="mode 644"):
+        read_key("mavlink.key", {"CREDENTIALS_DIRECTORY": str(tmp_path)})
+
+
+def test_a_key_that_is_not_there_gets_a_remedy(tmp_path):
+    with pytest.raises(ConfigError, match=r"can't be read.*owns.*mode 600.*credential"):
+        read_key(str(tmp_path / "none"), {})
 
 
 def test_missing_key_or_place_is_named(tmp_path):

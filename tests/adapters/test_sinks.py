@@ -171,6 +171,14 @@ def test_gps_input_is_a_receiver_without_velocity_and_knows_the_week():
     assert (m.hdop, m.vdop) == pytest.approx((2 / 3, 4 / 3))
 
 
+@pytest.mark.parametrize(("options", "gps_id"), [({}, 1), ({"gps_id": 0}, 0)])
+def test_gps_input_addresses_the_second_receiver_unless_told_otherwise(options, gps_id):
+    made, _ = outlet(send=("gps_input",), **options)
+    said = estimate()
+    (message,) = made.encode(said, ARDUPILOT, ORIGIN, said.stamp_ns, WALL_NS, recovery=False)
+    assert over_the_wire(message).gps_id == gps_id
+
+
 @pytest.mark.parametrize("unix_s", [0, 86_400, 1_700_000_000, 4_000_000_000])
 def test_gps_input_without_a_date_is_refused(unix_s):
     said = estimate()
@@ -209,17 +217,33 @@ def test_the_recovery_command():
     ],
 )
 def test_automatic_choice(autopilot, version, sink):
-    choice = choose_sinks(("auto",), autopilot, version)
+    choice = choose_sinks(("auto",), AutopilotIdentity(7, autopilot, version))
     assert choice.sinks == (sink,) and not choice.doubts and choice.why
 
 
+@pytest.mark.parametrize(
+    ("autopilot", "version"),
+    [(Autopilot.PX4, (1, 18, 0)), (Autopilot.ARDUPILOT, (4, 7, 0)), (Autopilot.ARDUPILOT, (4, 8, 0))],
+)
+def test_a_development_build_gets_what_either_of_its_neighbours_reads(autopilot, version):
+    vehicle = AutopilotIdentity(7, autopilot, version, development=True)
+    choice = choose_sinks(("auto",), vehicle)
+    assert choice.sinks == (Sink.ODOMETRY,) and "(dev build)" in choice.why
+    said = estimate(sigma_m=0.5)
+    sent = encode(Sink.ODOMETRY, said, ORIGIN, Sending(vehicle, said.stamp_ns))
+    unknown = encode(Sink.ODOMETRY, said, ORIGIN, Sending(replace(vehicle, firmware_version=None), said.stamp_ns))
+    assert sent.pose_covariance == unknown.pose_covariance
+    wide = encode(Sink.ODOMETRY, estimate(sigma_m=20.0), ORIGIN, Sending(vehicle, said.stamp_ns))
+    assert isinstance(wide, Refusal) is (autopilot is Autopilot.ARDUPILOT)
+
+
 def test_named_sinks_are_sent_with_their_doubts():
-    choice = choose_sinks(("gps_input", "odometry"), Autopilot.PX4, (1, 16, 0))
+    choice = choose_sinks(("gps_input", "odometry"), AutopilotIdentity(7, Autopilot.PX4, (1, 16, 0)))
     assert choice.sinks == (Sink.GPS_INPUT, Sink.ODOMETRY)
     unread, twice = choice.doubts
     assert "px4 1.16.0" in unread and "GPS_INPUT" in unread
     assert "fuse only one" in twice
-    (unread,) = choose_sinks(("global_position_sensor",), Autopilot.ARDUPILOT, (4, 8, 0)).doubts
+    (unread,) = choose_sinks(("global_position_sensor",), AutopilotIdentity(7, Autopilot.ARDUPILOT, (4, 8, 0))).doubts
     assert "GLOBAL_POSITION_SENSOR" in unread
 
 

@@ -95,7 +95,14 @@ def test_usage_errors_are_code_two(capsys: pytest.CaptureFixture[str]) -> None:
     assert "5km" in capsys.readouterr().err
 
 
+def test_no_delay_is_one_too(capsys: pytest.CaptureFixture[str]) -> None:
+    """The one that fast-forward asks for; the flight is refused for its duration alone."""
+    assert main(["sim", "--viso-delay-ms", "0", "--duration", "1"]) == EXIT_CONFIG
+    assert "less than 30 s" in capsys.readouterr().err
+
+
 NUMBERS = [
+    ("sim --viso-delay-ms=-1", "below zero"),
     ("replay x --seed=-1", "seed"),
     ("replay x --seed 1.5", "seed"),
     ("replay x --attitude-sigma-deg=-1,1,3", "from 0 to 180"),

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import socket
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -61,6 +63,13 @@ def test_a_stock_ardupilot_is_read_and_left_alone(capsys: pytest.CaptureFixture[
     assert "2 errors" in text
 
 
+def test_a_development_build_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    with autopilot(ARDUPILOT_READY, version=(4, 8, 0), version_type=0) as (_, endpoint):
+        assert main(["doctor", "--link", endpoint]) == 0
+    text = capsys.readouterr().out
+    assert "ardupilot 4.8.0 (dev build), system 7" in text and "note     firmware: 4.8.0 (dev build)" in text
+
+
 def test_a_set_up_that_works_over_a_serial_line(capsys: pytest.CaptureFixture[str]) -> None:
     with autopilot(ARDUPILOT_READY, PtyWire(), slow={"VISO_TYPE": 2, "EK3_ENABLE": 1}) as (_, endpoint):
         assert main(["doctor", "--link", endpoint, "--latency-ms", "20"]) == 0
@@ -76,9 +85,36 @@ def test_ardupilot_is_mended(capsys: pytest.CaptureFixture[str]) -> None:
     assert "VISO_TYPE = 1, read back" in text and "restart the autopilot for VISO_TYPE\n" in text
 
 
-def test_px4_is_mended_in_its_own_encoding(capsys: pytest.CaptureFixture[str]) -> None:
+def configured(folder: Path, **link: Any) -> str:
+    """The example's configuration with strings or numbers of [link] replaced."""
+    text = CONFIG.read_text(encoding="utf-8")
+    for name, value in link.items():
+        text, found = re.subn(rf'(?m)^{name} = (".*?"|[\d.]+)', f"{name} = {json.dumps(value)}", text)
+        assert found == 1
+    path = folder / "configured.toml"
+    path.write_text(text, encoding="utf-8")
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("release", "latency_ms", "viso_delay_ms"),
+    [("fast-forward", 150, 0), ("fixed-latency", 150, 250), ("raw", 150, 150), (None, 150, 0)],
+)
+def test_a_latency_counts_as_the_release_makes_of_it(
+    release: str | None, latency_ms: int, viso_delay_ms: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with autopilot({**ARDUPILOT_READY, "VISO_DELAY_MS": 200}) as (fake, endpoint):
+        command = ["doctor", "--link", endpoint, "--latency-ms", str(latency_ms), "--fix", "--yes"]
+        main(command if release is None else [*command, "--config", configured(tmp_path, release=release)])
+        # Half a round trip comes to it.
+        assert viso_delay_ms <= fake.parameters["VISO_DELAY_MS"] <= min(viso_delay_ms + 15, 250)
+    capsys.readouterr()
+
+
+def test_px4_is_mended_in_its_own_encoding(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = configured(tmp_path, release="raw")
     with autopilot(PX4_STOCK, autopilot=dialect.MAV_AUTOPILOT_PX4, version=(1, 14, 3)) as (fake, endpoint):
-        command = ["doctor", "--link", endpoint, "--latency-ms", "220", "--fix", "--yes", "--json"]
+        command = ["doctor", "--config", config, "--link", endpoint, "--latency-ms", "220", "--fix", "--yes", "--json"]
         assert main(command) == 0
         assert fake.parameters == {**PX4_STOCK, "EKF2_EV_CTRL": 1, "EKF2_HGT_REF": 0, "EKF2_DELAY_MAX": 270.0}
     facts = json.loads(capsys.readouterr().out)
@@ -110,6 +146,51 @@ def test_an_armed_vehicle_is_left_alone(caplog: pytest.LogCaptureFixture) -> Non
         assert main(["doctor", "--link", endpoint, "--fix", "--yes"]) == 1
         assert fake.got_counts["PARAM_SET"] == 0
     assert "armed; nothing is changed" in caplog.text
+
+
+class Answers:
+    """Standard input of somebody who answers yes, and does something before the given answer."""
+
+    def __init__(self, before: int, action: Callable[[], None]) -> None:
+        self.before, self.action, self.asked = before, action, 0
+
+    def readline(self) -> str:
+        self.asked += 1
+        if self.asked == self.before:
+            self.action()
+        return "y\n"
+
+
+@pytest.mark.parametrize("before", [1, 2])
+def test_a_vehicle_that_is_armed_before_the_answer_is_left_alone(
+    before: int, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with autopilot(ARDUPILOT_STOCK) as (fake, endpoint):
+
+        def arm() -> None:
+            fake.base_mode = dialect.MAV_MODE_FLAG_SAFETY_ARMED
+            time.sleep(0.6)  # its heartbeat comes five times a second
+
+        answers = Answers(before, arm)
+        monkeypatch.setattr("sys.stdin", answers)
+        assert main(["doctor", "--link", endpoint, "--fix"]) == 1
+        assert answers.asked == before and len(fake.parameters_set) == before - 1
+    assert "the vehicle is armed" in caplog.text
+
+
+def test_a_vehicle_that_fell_silent_is_left_alone(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with autopilot(ARDUPILOT_STOCK) as (fake, endpoint):
+
+        def fall_silent() -> None:
+            fake.mute = True
+            time.sleep(3.5)
+
+        monkeypatch.setattr("sys.stdin", Answers(1, fall_silent))
+        assert main(["doctor", "--link", endpoint, "--fix"]) == 1
+        assert fake.got_counts["PARAM_SET"] == 0
+    assert "not known" in caplog.text and "nothing is changed" in caplog.text
 
 
 def test_firmware_without_a_parameter_says_so_at_once(capsys: pytest.CaptureFixture[str]) -> None:
@@ -182,6 +263,13 @@ def test_usage(arguments: list[str], problem: str, capsys: pytest.CaptureFixture
     with pytest.raises(SystemExit) as stop:
         main(["doctor", *arguments])
     assert stop.value.code == 2 and problem in capsys.readouterr().err
+
+
+def test_help_names_every_exit_status_and_what_is_asked_of_the_autopilot(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["doctor", "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    assert "78 the configuration or the endpoint" in text and "SET_MESSAGE_INTERVAL" in text
 
 
 def test_endpoints_that_cannot_be_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -75,7 +75,8 @@ class ArduPilot:
     """A firmware that receives frames on one link.
 
     Parameters bear their own names. ``origin`` is the public EKF origin in 1e-7 degrees. ``gps_accuracy_m``: of a
-    connected, healthy GPS. ``pr_31738``: a build with that pull request. ``dead_reckoning``: no position was fused
+    connected, healthy GPS. ``gps_type`` is that of the instance ``gps_instance``, from 0; the other is a receiver.
+    ``pr_31738``: a build with that pull request. ``dead_reckoning``: no position was fused
     for a second.
     """
 
@@ -88,6 +89,7 @@ class ArduPilot:
     viso_qual_min: int = 0
     ek3_posne_m_nse: float = 0.5
     gps_type: int = 14
+    gps_instance: int = 1
     gps_delay_ms: int = 0
     gps_accuracy_m: float | None = None
     pr_31738: bool = False
@@ -208,6 +210,8 @@ class ArduPilot:
     def _gps_input(self, m: Any, local_us: int) -> Used | Dropped:
         if self.gps_type != 14:
             return Dropped("GPSn_TYPE is not 14")
+        if m.gps_id != self.gps_instance:
+            return Dropped(f"gps_id {m.gps_id} is not this instance")
         if m.fix_type < FIX_3D:
             return Dropped(f"fix type {m.fix_type}")
         accuracy_m = 0.0 if m.ignore_flags & IGNORE_HORIZONTAL_ACCURACY else m.horiz_accuracy

@@ -116,7 +116,7 @@ def flight(
     The command is not a stream: it goes ahead of each message of the sink that is chosen for the firmware.
     """
     noise = random.Random(5)
-    (stream,) = choose_sinks(("auto",), row.autopilot, row.version).sinks
+    (stream,) = choose_sinks(("auto",), row.vehicle).sinks
     for n in range(count):
         stamp_ns = 1000 * S + round(n * S / rate_hz)
         said = estimate(row.autopilot, stamp_ns=stamp_ns)

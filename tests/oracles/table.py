@@ -68,11 +68,14 @@ NOTES = """
   counts as 250 ms.
 - **ArduPilot's height** from ODOMETRY, with EK3_SRC1_POSZ at 6, gets the horizontal sigma; leave it at 1 (barometer).
 - **Position and yaw of unknown ArduPilot versions** are encoded so that neither reading of the covariance field claims
-  too little.
+  too little. So are those for builds that are not releases (dev, alpha, beta, rc: AUTOPILOT_VERSION tells), at any
+  version, since such a build may have what the release of its number has, or not. A PX4 build of that kind gets
+  ODOMETRY.
 - **MAV_CMD_EXTERNAL_POSITION_ESTIMATE** (`[link] recovery = true`) goes ahead of the first estimate after an outage, as
   ArduPilot takes it only while it has fused no position for a second, and PX4 only while it dead reckons.
 - **GPS_INPUT** needs the date. While the system clock is not between 2026 and 2076 it is refused. A step of that clock
-  is a step of its stamps; ArduPilot then takes up to 100 messages to find the delay again.
+  is a step of its stamps; ArduPilot then takes up to 100 messages to find the delay again. It is for one GPS instance,
+  `[link] gps_id` (1 unless set: the second, GPS2_TYPE 14); ArduPilot drops what is for another without a word.
 - **VISION_POSITION_ESTIMATE** has no quality: with VISO_QUAL_MIN or EKF2_EV_QMIN above 0 it is dropped.
 """
 
@@ -181,7 +184,7 @@ def cells(row: Row) -> list[str]:
     first = heard(row, oracle, estimate(row.autopilot))
     if isinstance(first, Dropped):
         return [version, name, *["–"] * 7, f"all ({first.why})"]
-    chosen = "auto" if row.sink in choose_sinks(("auto",), row.autopilot, row.version).sinks else "name"
+    chosen = "auto" if row.sink in choose_sinks(("auto",), row.vehicle).sinks else "name"
     found = ratios(row)
     if row.version is None and row.sink.local:
         used = f"{min(found):.2f} to {max(found):.2f}"

@@ -153,7 +153,7 @@ def test_what_is_known_to_be_read_is_read(row: Row):
 
 @pytest.mark.parametrize("row", ROWS, ids=str)
 def test_auto_takes_one_that_is_read(row: Row):
-    (sink,) = choose_sinks(("auto",), row.autopilot, row.version).sinks
+    (sink,) = choose_sinks(("auto",), row.vehicle).sinks
     assert replace(row, sink=sink) in READ
 
 
@@ -268,6 +268,13 @@ def test_the_commands_coarse_time_is_never_ahead(uptime_s):
         assert 0.0 <= expected_s - command.param1 <= max(1e-4, expected_s * 2.0**-23)
         assert command.param2 == pytest.approx(0.3)
         assert math.isnan(command.z)
+
+
+def test_gps_input_for_another_instance_is_dropped():
+    row = Row(Autopilot.ARDUPILOT, (4, 6, 3), Sink.GPS_INPUT)
+    assert heard(row, row.oracle((4, 6, 3), gps_instance=0), estimate(Autopilot.ARDUPILOT)) == Dropped(
+        "gps_id 1 is not this instance"
+    )
 
 
 def test_jitter_correction_forgets_after_a_hundred():

@@ -75,7 +75,7 @@ class Situation:
     Attributes:
         autopilot: None while none was found.
         sinks: names of the messages that carry our estimates, as in ``[link] send``.
-        sensor_id: ours in GLOBAL_POSITION_SENSOR.
+        sensor_id: ours in GLOBAL_POSITION_SENSOR. gps_id: ours in GPS_INPUT.
         lever_arm_m: ``[mount] lever_arm_m``, which we take off ourselves; None if it isn't known.
         ages: of estimates when they arrive; None if that isn't known.
         baud: of our serial line; None for a network.
@@ -88,6 +88,7 @@ class Situation:
     health: LinkHealth
     readings: Mapping[str, Reading]
     sensor_id: int = 1
+    gps_id: int = 1
     lever_arm_m: tuple[float, float, float] | None = None
     ages: Ages | None = None
     baud: int | None = None
@@ -166,16 +167,16 @@ def _delay(situation: Situation, name: str, most_ms: float, latency_ms: float | 
             "a constant delay is known to the filter by this parameter alone, and no measured latency was given",
             "measure it (the daemon reports it) and give it with --latency-ms",
         )  # fmt: skip
-    elif latency_ms > most_ms:
+    elif latency_ms > most_ms + _DELAY_SLACK_MS:
         yield Finding(
             Level.ERROR, name, f"{found:g}", f"{latency_ms:.0f}",
             f"fixes are {latency_ms:.0f} ms old when they are sent, and this parameter ends at {most_ms:g}: what is "
             "older is taken for newer than it is",
             "make the pipeline faster, or have fixes carried forward before they are sent",
         )  # fmt: skip
-    elif abs(found - latency_ms) > _DELAY_SLACK_MS:
+    elif abs(found - min(latency_ms, most_ms)) > _DELAY_SLACK_MS:
         yield from _setting(
-            situation, Level.WARNING, name, round(latency_ms),
+            situation, Level.WARNING, name, round(min(latency_ms, most_ms)),
             "a constant delay is known to the filter by this parameter alone: each 10 ms wrong are 0.2 m at 20 m/s",
             reboot=True,
         )  # fmt: skip
@@ -230,7 +231,7 @@ def _heartbeat(situation: Situation) -> Iterator[Finding]:
     elif any(peer.autopilot == "other" for peer in others):
         yield Finding(
             Level.ERROR, "autopilot", "neither ArduPilot nor PX4", "ardupilot or px4",
-            "its messages and parameters are not known", "set [link] autopilot if it is a derivative of one of them",
+            "its messages and parameters are not known", "set [link] autopilot to the one that it derives from, if so",
         )  # fmt: skip
     elif health.peers:
         heard = ", ".join(f"{peer.system_id}/{peer.component_id} ({peer.role})" for peer in health.peers)
@@ -368,6 +369,13 @@ def _firmware(situation: Situation) -> Iterator[Finding]:
         yield Finding(
             Level.WARNING, "firmware", ".".join(map(str, situation.firmware)), f"{text} or newer",
             "parameters and messages of older versions were not looked at", "update the autopilot",
+        )  # fmt: skip
+    if situation.health.vehicle is not None and situation.health.vehicle.development:
+        yield Finding(
+            Level.NOTE, "firmware", situation.health.vehicle.firmware, "a release",
+            "a build between two releases may read covariances as either of them does, so ours are encoded for both, "
+            "and only what every version reads is sent unless [link] send names it",
+            "install a release, or leave it",
         )  # fmt: skip
 
 
@@ -513,6 +521,20 @@ def _vision_sources(situation: Situation) -> Iterator[Finding]:
             yield from _setting(situation, Level.WARNING, yaw, _COMPASS, "this heading needs GNSS")
 
 
+def _velocities(situation: Situation) -> Iterator[Finding]:
+    """EK3_SRC_OPTIONS bit 0, which is on in stock firmware."""
+    found = situation.value("EK3_SRC_OPTIONS")
+    gnss = [n for n in (1, 2, 3) if situation.value(f"EK3_SRC{n}_VELXY") == _GNSS]
+    if found is not None and int(found) & 1 and _vision_sets(situation) and gnss:
+        bits = int(found) & ~1
+        yield Finding(
+            Level.NOTE, "EK3_SRC_OPTIONS", f"{found:g}", f"{bits} where GNSS may be deceived",
+            "bit 0 fuses the velocities of all source sets: while a receiver has a fix its velocity also steers the "
+            "set for vision",
+            f"param set EK3_SRC_OPTIONS {bits}",
+        )  # fmt: skip
+
+
 def _switching(situation: Situation) -> Iterator[Finding]:
     sets = _vision_sets(situation)
     options = [situation.value(name) for name in _RC_OPTIONS]
@@ -525,12 +547,19 @@ def _switching(situation: Situation) -> Iterator[Finding]:
 
 
 def _gps_types(situation: Situation) -> Iterator[Finding]:
-    names = [name for name in _GPS_TYPES if situation.value(name) is not None]
-    if names and all(situation.value(name) != 14 for name in names):
-        # The second one, so that a receiver in the first place stays.
-        yield from _setting(
-            situation, Level.ERROR, names[-1], 14, "no GPS instance takes GPS_INPUT (14, MAV)", reboot=True
-        )
+    names = _GPS_TYPES[situation.gps_id]
+    if all(situation.absent(name) for name in names):
+        yield Finding(
+            Level.ERROR, names[-1], "this firmware has none", "14",
+            f"it has no GPS instance {situation.gps_id}, to which our GPS_INPUT is addressed",
+            "install a firmware with two GPS instances, or set [link] gps_id to one that there is",
+        )  # fmt: skip
+    for name in names:
+        yield from _expect(
+            situation, Level.ERROR, name, 14,
+            f"GPS_INPUT is taken by type 14 (MAV) only, and [link] gps_id = {situation.gps_id} addresses this instance",
+            reboot=True,
+        )  # fmt: skip
 
 
 def _gps_sources(situation: Situation) -> Iterator[Finding]:
@@ -722,8 +751,8 @@ def _px4_port(situation: Situation) -> Iterator[Finding]:
 
 _A, _P = Autopilot.ARDUPILOT, Autopilot.PX4
 _RC_OPTIONS = tuple(f"RC{n}_OPTION" for n in range(5, 17))
-# Two names each: up to 4.5, and from 4.6.
-_GPS_TYPES = ("GPS_TYPE", "GPS1_TYPE", "GPS_TYPE2", "GPS2_TYPE")
+# By instance, two names each: up to 4.5, and from 4.6.
+_GPS_TYPES = (("GPS_TYPE", "GPS1_TYPE"), ("GPS_TYPE2", "GPS2_TYPE"))
 _SERIAL_PROTOCOLS = tuple(f"SERIAL{n}_PROTOCOL" for n in range(1, 8))
 _SERIAL_BAUDS = tuple(f"SERIAL{n}_BAUD" for n in range(1, 8))
 _PX4_BAUDS = ("SER_TEL1_BAUD", "SER_TEL2_BAUD", "SER_TEL3_BAUD")
@@ -746,13 +775,14 @@ _RULES = (
     _Rule(_ekf3, ("AHRS_EKF_TYPE", "EK3_ENABLE"), _A),
     _Rule(_viso_type, ("VISO_TYPE",), _A, LOCAL),
     _Rule(_vision_sources, _SOURCES, _A, LOCAL),
+    _Rule(_velocities, ("EK3_SRC_OPTIONS",), _A, LOCAL),
     _Rule(_viso_delay, ("VISO_DELAY_MS",), _A, LOCAL),
     _Rule(_viso_lever_arm, ("VISO_POS_X", "VISO_POS_Y", "VISO_POS_Z"), _A, LOCAL),
     _Rule(_viso_conversion, ("VISO_SCALE", "VISO_ORIENT"), _A, LOCAL),
     _Rule(_viso_noise, ("VISO_QUAL_MIN", "VISO_POS_M_NSE"), _A, LOCAL),
     _Rule(_gates, ("EK3_POS_I_GATE", "EK3_GLITCH_RAD"), _A),
     _Rule(_switching, _RC_OPTIONS, _A, LOCAL),
-    _Rule(_gps_types, _GPS_TYPES, _A, _GPS),
+    _Rule(_gps_types, (*_GPS_TYPES[0], *_GPS_TYPES[1]), _A, _GPS),
     _Rule(_gps_sources, _SOURCES, _A, _GPS),
     _Rule(_ev_ctrl, ("EKF2_EV_CTRL",), _P, LOCAL),
     _Rule(_ev_delay, ("EKF2_EV_DELAY",), _P, LOCAL),

@@ -71,6 +71,7 @@ class Checkup:
             ages=self._ages(),
             baud=self._baud,
             sensor_id=self._options.sensor_id,
+            gps_id=self._options.gps_id,
         )
 
     def findings(self) -> list[Finding]:

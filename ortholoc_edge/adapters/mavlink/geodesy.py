@@ -9,7 +9,7 @@ from enum import StrEnum
 import numpy as np
 
 from ortholoc_edge.geometry.arrays import FloatArray
-from ortholoc_edge.geometry.frames import ecef_from_geodetic, ned_from_ecef_rotation
+from ortholoc_edge.geometry.frames import ecef_from_geodetic
 
 # Radius behind ArduPilot's LATLON_TO_M (0.011131884502145034 m per 1e-7 degree; AP_Common/Location.h).
 _ARDUPILOT_RADIUS_M = math.degrees(0.011131884502145034 * 1e7)
@@ -29,7 +29,6 @@ class EarthModel(StrEnum):
     distance from the origin.
     """
 
-    WGS84 = "wgs84"  # true metres of the tangent plane
     ARDUPILOT = "ardupilot"  # Location::get_distance_NE: equirectangular, cosine of the mean latitude
     PX4 = "px4"  # MapProjection: azimuthal equidistant
 
@@ -92,18 +91,9 @@ def ned_from_geodetic(
     """North, east, down (3,) in m of a position relative to ``origin``.
 
     Down is the difference of the two heights above sea level: the autopilots' "down" follows the curved sea
-    level, not the tangent plane (which falls away by 8 cm in 1 km). North and east are, in ``WGS84``, offsets
-    in the tangent plane at the origin of the point brought to the origin's height; the undulation of the
-    geoid, at most 110 m, is neglected in that height and changes them by less than 2 cm per km.
+    level, not the tangent plane (which falls away by 8 cm in 1 km).
     """
-    if model is EarthModel.WGS84:
-        lat0, lon0 = math.radians(origin.latitude_deg), math.radians(origin.longitude_deg)
-        height = origin.height_amsl_m
-        offset = ecef_from_geodetic(
-            math.radians(latitude_deg), math.radians(longitude_deg), height
-        ) - ecef_from_geodetic(lat0, lon0, height)
-        north, east, _ = ned_from_ecef_rotation(lat0, lon0) @ offset
-    elif model is EarthModel.ARDUPILOT:
+    if model is EarthModel.ARDUPILOT:
         north = _ARDUPILOT_RADIUS_M * math.radians(latitude_deg - origin.latitude_deg)
         east = (
             _ARDUPILOT_RADIUS_M

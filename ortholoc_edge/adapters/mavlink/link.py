@@ -45,7 +45,7 @@ _TCP_SILENCE_NS = 10 * _S
 _BACKOFF_MIN_S, _BACKOFF_MAX_S = 0.5, 10.0
 _SELECT_TIMEOUT_S = 0.05
 _GIVE_UP_AFTER_ERRORS = 10
-_CARRY_ESTIMATES = {sink.value.upper() for sink in Sink}
+_CARRY_ESTIMATES = {sink.value.upper() for sink in Sink if sink is not Sink.EXTERNAL_POSITION_ESTIMATE}
 # For `sys.setswitchinterval`, by who owns the process: how long the link's thread waits at most for a thread that
 # computes in Python. By default 5 ms, each time that it comes back from the kernel.
 SWITCH_INTERVAL_S = 1e-4
@@ -239,10 +239,14 @@ class AutopilotLink:
         with self._lock:
             return self._protocol.delay_advice()
 
-    def ages(self) -> Ages | None:
-        """How old estimates are when they arrive: known of the mode of release, or measured; None before that."""
+    def ages(self, latency_ms: float | None = None) -> Ages | None:
+        """How old estimates are when they arrive: known of the mode of release, or measured; None before that.
+
+        Args:
+            latency_ms: from mid-exposure until a fix is there to be sent, where it was measured elsewhere.
+        """
         with self._lock:
-            return self._protocol.ages()
+            return self._protocol.ages(latency_ms)
 
     def trouble(self) -> str | None:
         """Why nothing current is known of the vehicle, where the link is to blame; None where it is not."""
@@ -316,7 +320,8 @@ class AutopilotLink:
     def offer_origin(self, origin: GeodeticOrigin) -> None:
         """Set the EKF origin if the autopilot turns out to have none and ``options.set_origin`` allows it.
 
-        Repeated until the autopilot tells an origin. That one counts, whether it is ours or not.
+        That is so once it answered other things, but three questions for its origin not. Repeated until it tells one,
+        which then counts, whether it is ours or not. Forgotten when the autopilot restarts.
         """
         with self._lock:
             self._protocol.offer_origin(origin)
@@ -543,6 +548,8 @@ class AutopilotLink:
         if verdict is Verdict.TOO_OLD and not self._peer_is_vehicle:
             # Its clock catches up as soon as it hears a signed frame of ours, for which it must be spoken to.
             transport.prefer(peer)
+            with self._lock:
+                self._protocol.speaks_first = True
         return False
 
     def _retire(self, parser: FrameParser) -> None:

@@ -18,7 +18,6 @@ class SystemStatus(IntEnum):
     BOOT = 1
     STANDBY = 3
     ACTIVE = 4
-    CRITICAL = 5
 
 
 class Severity(IntEnum):
@@ -44,15 +43,18 @@ class LinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         component_id: 197 is MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY.
         send: which messages carry an estimate; "auto" alone takes the best that the autopilot's firmware reads.
         sensor_id: ours in GLOBAL_POSITION_SENSOR; PX4 wants it in EKF2_AGPn_ID.
+        gps_id: the receiver that we pretend to be in GPS_INPUT: 0 is ArduPilot's GPS1_TYPE, 1 its GPS2_TYPE, which must
+            be 14. Another instance drops the message silently.
         recovery: whether the first fix after an outage also goes as MAV_CMD_EXTERNAL_POSITION_ESTIMATE, by which a
             filter that dead reckons sets its position to ours at once.
-        autopilot: overrides what the heartbeat says.
+        autopilot: overrides what the heartbeat says. A derivative with a MAV_AUTOPILOT of its own is served only with
+            it.
         attitude_rate_hz, position_rate_hz: of ATTITUDE_QUATERNION and LOCAL_POSITION_NED, asked of the
             autopilot.
         set_origin: whether `AutopilotLink.offer_origin` may set the EKF origin of an autopilot that has none.
         release: how fixes go out (`release`): carried on to the moment of sending, several times each; each once at
             the same age; or each once as soon as it is there.
-        estimate_rate_hz: of "fast-forward"; 0 is the same as "raw". A serial line must have room for it (`bandwidth`).
+        estimate_rate_hz: of "fast-forward", which with 0 is "raw". A serial line must have room for it (`bandwidth`).
             max_repeat_s: how long it goes on without a new fix.
         fixed_latency_ms: the age of "fixed-latency".
         switch_sources: whether we may tell ArduPilot to take another source set (MAV_CMD_SET_EKF_SOURCE_SET) when
@@ -74,6 +76,7 @@ class LinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         Literal["auto", "odometry", "vision_position_estimate", "global_position_sensor", "gps_input"], ...
     ] = ("auto",)
     sensor_id: Annotated[int, msgspec.Meta(ge=1, le=255)] = 1
+    gps_id: Annotated[int, msgspec.Meta(ge=0, le=1)] = 1
     recovery: bool = False
     autopilot: Literal["auto", "ardupilot", "px4"] = "auto"
     attitude_rate_hz: Annotated[float, msgspec.Meta(ge=1, le=400)] = 50.0

@@ -42,7 +42,7 @@ class Outlet:
     def sinks(self, vehicle: AutopilotIdentity) -> tuple[Sink, ...]:
         """Those that carry the estimates for an autopilot. Says so in the log when it is another one than before."""
         if vehicle != self._chosen_for:
-            choice = choose_sinks(self._options.send, vehicle.autopilot, vehicle.firmware_version)
+            choice = choose_sinks(self._options.send, vehicle)
             self._chosen_for, self._sinks = vehicle, choice.sinks
             self._floor_told.clear()
             said = ", ".join(_said(sink, vehicle) for sink in choice.sinks)
@@ -55,7 +55,7 @@ class Outlet:
 
     def believed(self, vehicle: AutopilotIdentity) -> tuple[float, float]:
         """The most that every chosen sink believes of a sigma of position, m, and of yaw, rad."""
-        bounds = [limits(sink, vehicle.autopilot, vehicle.firmware_version) for sink in self.sinks(vehicle)]
+        bounds = [limits(sink, vehicle.autopilot, vehicle.release) for sink in self.sinks(vehicle)]
         return (
             min((bound.most_sigma_m for bound in bounds), default=math.inf),
             min((bound.most_yaw_sigma_rad for bound in bounds), default=math.inf),
@@ -81,8 +81,9 @@ class Outlet:
         sinks = self.sinks(vehicle)
         # A stream that counts from the capture makes the command do so, too.
         capture_stamps = any(sink.local for sink in sinks)
-        sending = Sending(vehicle, now_ns, wall_ns, capture_stamps, self._options.sensor_id)
-        if recovery and self._options.recovery and self._recovers(vehicle):
+        options = self._options
+        sending = Sending(vehicle, now_ns, wall_ns, capture_stamps, options.sensor_id, options.gps_id)
+        if recovery and options.recovery and self._recovers(vehicle):
             sinks = (Sink.EXTERNAL_POSITION_ESTIMATE, *sinks)
         messages = []
         for sink in sinks:
@@ -99,10 +100,10 @@ class Outlet:
 
     @staticmethod
     def _recovers(vehicle: AutopilotIdentity) -> bool:
-        return is_known_to_read(Sink.EXTERNAL_POSITION_ESTIMATE, vehicle.autopilot, vehicle.firmware_version)
+        return is_known_to_read(Sink.EXTERNAL_POSITION_ESTIMATE, vehicle.autopilot, vehicle.release)
 
     def _tell_floor(self, sink: Sink, estimate: VisionEstimate, vehicle: AutopilotIdentity) -> None:
-        bounds = limits(sink, vehicle.autopilot, vehicle.firmware_version)
+        bounds = limits(sink, vehicle.autopilot, vehicle.release)
         sigma_m = horizontal_sigma_m(estimate)
         if sigma_m >= bounds.least_sigma_m:
             return
@@ -116,7 +117,7 @@ class Outlet:
 
 
 def _said(sink: Sink, vehicle: AutopilotIdentity) -> str:
-    bounds = limits(sink, vehicle.autopilot, vehicle.firmware_version)
+    bounds = limits(sink, vehicle.autopilot, vehicle.release)
     rates = []
     if bounds.least_rate_hz:
         rates.append(f"wanted at {bounds.least_rate_hz:g} Hz or more")

@@ -15,7 +15,7 @@ from ortholoc_edge.adapters.mavlink.gimbal import GimbalSelection
 from ortholoc_edge.adapters.mavlink.latency import Ages, DelayAdvice, LatencyMeter, advise, ages_of
 from ortholoc_edge.adapters.mavlink.log import LimitedLog
 from ortholoc_edge.adapters.mavlink.monitor import FusionMonitor, FusionReport
-from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus
+from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus, parse_endpoint
 from ortholoc_edge.adapters.mavlink.outlet import Outlet
 from ortholoc_edge.adapters.mavlink.parameters import ParameterClient
 from ortholoc_edge.adapters.mavlink.release import MAX_AGE_MS, Outgoing, Release
@@ -42,6 +42,12 @@ _AUTOPILOTS = {
 
 # An autopilot sends HEARTBEAT at 1 Hz; three missing is how ground stations judge it too.
 _SILENT_AFTER_NS = 3 * _S
+# A serial line on which no autopilot was heard for this long: some begin to speak MAVLink only when they are spoken to
+# (PX4 over USB).
+_SPEAK_FIRST_AFTER_NS = 5 * _S
+# An autopilot that answers other things, but this many questions for its origin in a row not, has none. One may be
+# lost, and ours must not replace an origin that is there.
+_ORIGIN_QUESTIONS = 3
 
 # The same text is logged once in this time; of this many texts it is known when that was.
 _TEXT_AGAIN_NS = 10 * _S
@@ -87,9 +93,16 @@ class LinkProtocol:
         self._vehicle: AutopilotIdentity | None = None
         self._heartbeat_ns = 0
         self._silent = False
+        # Ours would carry a system id that nobody has, were they sent before the vehicle's is known; but who connects
+        # out must speak first, as a router learns from it where we are.
+        self._endpoint_kind = parse_endpoint(options.endpoint).kind
+        self.speaks_first = options.system_id != 0 or self._endpoint_kind in ("udpout", "tcp")
+        self._first_poll_ns: int | None = None
         # Other autopilots' system ids, each with when it was heard last.
         self._others: dict[int, int] = {}
         self._offered_origin: GeodeticOrigin | None = None
+        self._origin_unanswered = 0
+        self._answers_since = False
         self._home_known = False
         self._streams: dict[str, Stream] = {}
         self._heartbeat_timer = Repeat(1 * _S)
@@ -174,6 +187,8 @@ class LinkProtocol:
         restart = self.telemetry.take(message, arrival_ns)
         if restart is not None:
             self._start_over(restart, arrival_ns)
+        # Not the origin itself, which would have ended the questions.
+        self._answers_since |= name in ("TIMESYNC", "COMMAND_ACK", "AUTOPILOT_VERSION", "PARAM_VALUE")
         handler = self._handlers.get(name)
         if handler is not None:
             handler(message, arrival_ns)
@@ -185,20 +200,29 @@ class LinkProtocol:
         return (
             message.get_type() == "HEARTBEAT"
             and message.get_srcComponent() == _AUTOPILOT_COMPONENT
-            and message.autopilot in _AUTOPILOTS
-            and message.type != dialect.MAV_TYPE_GCS
+            and self._autopilot_of(message) is not None
             and self._options.system_id in (0, message.get_srcSystem())
         )
 
+    def _autopilot_of(self, heartbeat: MavlinkMessage) -> Autopilot | None:
+        """The autopilot that a heartbeat is of: as it says, or as configured; None if it is of none that we serve.
+
+        A derivative may have a number of its own. It is served only where somebody said what it derives from.
+        """
+        if heartbeat.type == dialect.MAV_TYPE_GCS or heartbeat.autopilot == dialect.MAV_AUTOPILOT_INVALID:
+            return None
+        said = _AUTOPILOTS.get(heartbeat.autopilot)
+        return said if self._options.autopilot == "auto" else Autopilot(self._options.autopilot)
+
     def _is_another_autopilot(self, message: MavlinkMessage) -> bool:
         return (
-            message.autopilot in _AUTOPILOTS
-            and message.type != dialect.MAV_TYPE_GCS
+            self._autopilot_of(message) is not None
             and self._options.system_id not in (0, message.get_srcSystem())
         )
 
     def _on_heartbeat(self, message: MavlinkMessage, system: int, arrival_ns: int) -> None:
-        if not self.is_vehicle_heartbeat(message):
+        autopilot = self._autopilot_of(message)
+        if autopilot is None or not self.is_vehicle_heartbeat(message):
             self.counts["ignored"] += 1
             if self._is_another_autopilot(message):
                 self._others[system] = arrival_ns
@@ -212,8 +236,7 @@ class LinkProtocol:
                 )
             return
         self.counts["received.HEARTBEAT"] += 1
-        said = _AUTOPILOTS[message.autopilot]
-        autopilot = said if self._options.autopilot == "auto" else Autopilot(self._options.autopilot)
+        said = _AUTOPILOTS.get(message.autopilot)
         known = self._vehicle
         if known is not None and system != known.system_id:
             # For the life of the process: where ours fell silent, another's attitude would be a neighbour's.
@@ -235,7 +258,8 @@ class LinkProtocol:
             self._streams = self._wanted_streams(autopilot)
             logger.info("autopilot found: %s, system %d", autopilot.value, system)
             if autopilot is not said:
-                logger.warning("autopilot says it is %s, configured is %s", said.value, autopilot.value)
+                name = f"of MAV_AUTOPILOT {message.autopilot}" if said is None else said.value
+                logger.warning("autopilot says it is %s, configured is %s", name, autopilot.value)
         elif self._silent:
             logger.info("autopilot is back")
         self._silent = False
@@ -254,6 +278,9 @@ class LinkProtocol:
         self._log(now_ns, logging.WARNING, "restart", f"autopilot: {why}; asking for its streams again")
         self.timesync.reset()
         self._home_known = False
+        # The one offered before is that of a life before; the next fix brings another.
+        self._offered_origin = None
+        self._origin_unanswered, self._answers_since = 0, False
         if self._vehicle is not None:
             self._vehicle = AutopilotIdentity(self._vehicle.system_id, self._vehicle.autopilot, None)
         for stream in self._streams.values():
@@ -280,9 +307,11 @@ class LinkProtocol:
         if v == 0 or self._vehicle is None:
             return
         version = (v >> 24 & 255, v >> 16 & 255, v >> 8 & 255)
-        if self._vehicle.firmware_version != version:
-            self._vehicle = AutopilotIdentity(self._vehicle.system_id, self._vehicle.autopilot, version)
-            logger.info("autopilot's firmware: %s %d.%d.%d", self._vehicle.autopilot.value, *version)
+        development = v & 255 != dialect.FIRMWARE_VERSION_TYPE_OFFICIAL
+        known = AutopilotIdentity(self._vehicle.system_id, self._vehicle.autopilot, version, development)
+        if self._vehicle != known:
+            self._vehicle = known
+            logger.info("autopilot's firmware: %s %s", known.autopilot.value, known.firmware)
 
     def _on_status_text(self, m: MavlinkMessage, arrival_ns: int) -> None:
         level = logging.WARNING if m.severity <= Severity.ERROR else logging.INFO
@@ -317,10 +346,17 @@ class LinkProtocol:
 
     # -- out --------------------
 
+    def _may_speak(self, now_ns: int) -> bool:
+        if self._first_poll_ns is None:
+            self._first_poll_ns = now_ns
+        if self._endpoint_kind == "serial" and now_ns - self._first_poll_ns >= _SPEAK_FIRST_AFTER_NS:
+            self.speaks_first = True
+        return self._vehicle is not None or self.speaks_first
+
     def poll(self, now_ns: int) -> list[MavlinkMessage]:
         """What is due now."""
         out: list[MavlinkMessage] = []
-        if self._heartbeat_timer.due(now_ns):
+        if self._may_speak(now_ns) and self._heartbeat_timer.due(now_ns):
             out.append(
                 dialect.MAVLink_heartbeat_message(
                     type=dialect.MAV_TYPE_ONBOARD_CONTROLLER,
@@ -355,10 +391,7 @@ class LinkProtocol:
         elif self._version_timer.due(now_ns):
             out.append(self._request(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION))
         if (self._origin_timer if self.telemetry.origin is None else self._origin_watch_timer).due(now_ns):
-            out.append(self._request(dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN))
-            if self.telemetry.origin is None and self._offered_origin is not None and self._options.set_origin:
-                # Lost before the filter has started, so it goes along with the question until answered.
-                out.append(self._set_origin(vehicle.system_id, self._offered_origin))
+            out += self._ask_origin(vehicle.system_id)
         if not self._home_known and self._home_timer.due(now_ns):
             out.append(self._request(dialect.MAVLINK_MSG_ID_HOME_POSITION))
         out += self._about_us(now_ns)
@@ -374,6 +407,19 @@ class LinkProtocol:
                 for component, message_id, interval_ns in self.telemetry.gimbal.requests(now_ns)
             ]
         out += self.parameters.poll(now_ns, vehicle.system_id, vehicle.autopilot)
+        return out
+
+    def _ask_origin(self, system_id: int) -> list[MavlinkMessage]:
+        """The question for the origin, and after it ours where there is none and we may set it."""
+        out = [self._request(dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)]
+        if self.telemetry.origin is not None:
+            return out
+        self._origin_unanswered += self._answers_since
+        self._answers_since = False
+        offered = self._offered_origin if self._options.set_origin else None
+        if offered is not None and self._origin_unanswered >= _ORIGIN_QUESTIONS:
+            # Lost before the filter has started, so it goes along with each question until answered.
+            out.append(self._set_origin(system_id, offered))
         return out
 
     def _watch(self, autopilot: Autopilot, now_ns: int) -> list[MavlinkMessage]:
@@ -419,10 +465,18 @@ class LinkProtocol:
             self.timesync.median_round_trip_ns,
         )  # fmt: skip
 
-    def ages(self) -> Ages | None:
-        """How old estimates arrive, by which the delay parameters are to be set; None while it must be measured."""
+    def ages(self, latency_ms: float | None = None) -> Ages | None:
+        """How old estimates arrive, by which the delay parameters are to be set; None while it must be measured.
+
+        Args:
+            latency_ms: from mid-exposure until a fix is there to be sent, instead of what was measured here.
+        """
+        meter = self.latency
+        if latency_ms is not None:
+            meter = LatencyMeter()
+            meter.add(round(latency_ms * _MS))
         return ages_of(
-            self.release.mode, self.latency, self._options.fixed_latency_ms, self.timesync.median_round_trip_ns
+            self.release.mode, meter, self._options.fixed_latency_ms, self.timesync.median_round_trip_ns
         )
 
     def _tell_delays(self) -> None:
@@ -521,7 +575,6 @@ class LinkProtocol:
         best = self.timesync.best(now_ns)
         round_trip = self.timesync.last_round_trip_ns
         vehicle = self._vehicle
-        version = vehicle.firmware_version if vehicle else None
         advice = self.delay_advice()
         return {
             **self.counts,
@@ -536,7 +589,7 @@ class LinkProtocol:
             "connected": self.connected(now_ns),
             "autopilot": vehicle.autopilot.value if vehicle else None,
             "vehicle_system_id": vehicle.system_id if vehicle else None,
-            "firmware": ".".join(map(str, version)) if version else None,
+            "firmware": vehicle.firmware if vehicle and vehicle.firmware_version else None,
             "gimbal": None if self.telemetry.gimbal is None else str(self.telemetry.gimbal),
             "origin_known": self.telemetry.origin is not None,
             "local_epoch": self.telemetry.local_epoch,

@@ -252,11 +252,16 @@ def read_key(name: str, environ: Mapping[str, str]) -> bytes:
     try:
         mode, content = path.stat().st_mode, path.read_bytes()
     except OSError as error:
-        raise ConfigError(f"[link] signing_key: {path} can't be read: {error.strerror}") from error
-    if mode & (stat.S_IROTH | stat.S_IWOTH):
         raise ConfigError(
-            f"[link] signing_key: every user may read or write {path} (mode {stat.S_IMODE(mode):o}), so it is no "
-            f"secret; make a new key, and chmod 600 it"
+            f"[link] signing_key: {path} can't be read: {error.strerror}; name a file that the user of this program "
+            "owns, with mode 600, or a systemd credential"
+        ) from error
+    # A credential of systemd's shows the mask of its access list where other files have their group's bits.
+    others = stat.S_IROTH | stat.S_IWOTH | (stat.S_IRGRP | stat.S_IWGRP if "/" in name else 0)
+    if mode & others:
+        raise ConfigError(
+            f"[link] signing_key: others than its owner may read or write {path} (mode {stat.S_IMODE(mode):o}), so it "
+            "is no secret; make a new key, and chmod 600 it"
         )
     key = content
     if len(content) != _KEY_BYTES:

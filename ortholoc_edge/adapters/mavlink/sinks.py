@@ -91,7 +91,7 @@ class CovarianceLayout(StrEnum):
 
     CUBE_ROOT = "cube_root"  # ArduPilot before 4.8
     SQUARE_ROOT = "square_root"  # ArduPilot from 4.8
-    EITHER_ROOT = "either_root"  # ArduPilot of unknown version
+    EITHER_ROOT = "either_root"  # ArduPilot of unknown version, or a build between two releases
     PER_AXIS = "per_axis"  # PX4, and the message definition
 
 
@@ -137,6 +137,7 @@ class Sending:
             message stamped at transmission would take the constant latency out of that offset, and
             VISO_DELAY_MS would count it twice for the next hundred messages.
         sensor_id: ``id`` of GLOBAL_POSITION_SENSOR.
+        gps_id: of GPS_INPUT: which of ArduPilot's GPS instances takes it, from 0.
     """
 
     vehicle: AutopilotIdentity
@@ -144,6 +145,7 @@ class Sending:
     wall_ns: int = 0
     capture_stamps: bool = False
     sensor_id: int = 1
+    gps_id: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,22 +182,26 @@ def is_known_to_read(sink: Sink, autopilot: Autopilot, version: Version | None) 
     return True
 
 
-def choose_sinks(send: tuple[str, ...], autopilot: Autopilot, version: Version | None) -> Choice:
-    """The sinks for a firmware: those named in ``send``, or the best one for ``("auto",)``.
+def choose_sinks(send: tuple[str, ...], vehicle: AutopilotIdentity) -> Choice:
+    """The sinks for an autopilot: those named in ``send``, or the best one for ``("auto",)``.
 
     "auto" takes one, never two: both would bring the same error to the filter as if they were independent. A sink
     that is named is sent even where the firmware is not known to read it; that is told among the doubts.
     """
-    who = f"{autopilot.value} {_text(version)}"
+    autopilot, version = vehicle.autopilot, vehicle.release
+    who = f"{autopilot.value} {vehicle.firmware}"
     if send == ("auto",):
         if is_known_to_read(Sink.GLOBAL_POSITION_SENSOR, autopilot, version):
             return Choice(
                 (Sink.GLOBAL_POSITION_SENSOR,), f"{who} takes a position on WGS 84, independent of its origin"
             )
-        if version is None:
+        if version is None and vehicle.development and autopilot is Autopilot.PX4:
+            why = f"{who}: every version reads it; what more such a build reads its number does not tell"
+        elif version is None:
             why = f"{who}: every version reads it, and its position sigma is encoded so that none is too small"
         elif autopilot is Autopilot.PX4:
-            why = f"{who} reads GLOBAL_POSITION_SENSOR only since {_text(PX4_GLOBAL_POSITION_SENSOR_SINCE)}"
+            since = ".".join(map(str, PX4_GLOBAL_POSITION_SENSOR_SINCE))
+            why = f"{who} reads GLOBAL_POSITION_SENSOR only since {since}"
         else:
             why = f"{who} reads it with position, attitude, covariance, quality and reset counter"
         return Choice((Sink.ODOMETRY,), why)
@@ -243,7 +249,7 @@ def encode(
         refusal = _without_position(sink, estimate, origin)
         if refusal is not None:
             return refusal
-        layout = covariance_layout(vehicle.autopilot, vehicle.firmware_version)
+        layout = covariance_layout(vehicle.autopilot, vehicle.release)
         local = encode_odometry if sink is Sink.ODOMETRY else encode_vision_position_estimate
         return local(estimate, layout)
     place = _place(estimate, vehicle.autopilot)
@@ -274,8 +280,8 @@ def _place(estimate: VisionEstimate, autopilot: Autopilot) -> Place | None:
 
 def _beyond_bounds(sink: Sink, estimate: VisionEstimate, vehicle: AutopilotIdentity) -> Refusal | None:
     """Where the filter would trust the estimate more than we do."""
-    bounds = limits(sink, vehicle.autopilot, vehicle.firmware_version)
-    who = f"{vehicle.autopilot.value} {_text(vehicle.firmware_version)}"
+    bounds = limits(sink, vehicle.autopilot, vehicle.release)
+    who = f"{vehicle.autopilot.value} {vehicle.firmware}"
     sigma_m, yaw_sigma = horizontal_sigma_m(estimate), yaw_sigma_rad(estimate)
     if sigma_m > bounds.most_sigma_m:
         why = f"position sigma {sigma_m:.1f} m, but {who} believes {bounds.most_sigma_m:g} m at most"
@@ -414,7 +420,7 @@ def encode_gps_input(estimate: VisionEstimate, place: Place, sending: Sending) -
     horizontal_m, vertical_m = horizontal_sigma_m(estimate), vertical_sigma_m(estimate)
     return dialect.MAVLink_gps_input_message(
         time_usec=estimate.stamp_ns // 1000,
-        gps_id=0,
+        gps_id=sending.gps_id,
         ignore_flags=dialect.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ
         | dialect.GPS_INPUT_IGNORE_FLAG_VEL_VERT
         | dialect.GPS_INPUT_IGNORE_FLAG_SPEED_ACCURACY,
@@ -480,7 +486,3 @@ def _float_below(value: float) -> float:
     """The largest single-precision number that is not above ``value``."""
     single = np.float32(value)
     return float(np.nextafter(single, np.float32(-np.inf)) if float(single) > value else single)
-
-
-def _text(version: Version | None) -> str:
-    return "of unknown version" if version is None else ".".join(map(str, version))

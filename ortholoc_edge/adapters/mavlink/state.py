@@ -11,11 +11,30 @@ from ortholoc_edge.geometry.arrays import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class AutopilotIdentity:
-    """Who answers on the link. ``firmware_version`` is None until AUTOPILOT_VERSION came."""
+    """Who answers on the link.
+
+    Attributes:
+        firmware_version: None until AUTOPILOT_VERSION came.
+        development: whether that is of a build between two releases (dev, alpha, beta, release candidate), which may
+            or may not have what the release of that number has.
+    """
 
     system_id: int
     autopilot: Autopilot
     firmware_version: tuple[int, int, int] | None
+    development: bool = False
+
+    @property
+    def release(self) -> tuple[int, int, int] | None:
+        """The version by which to know what the firmware does; None where that is uncertain."""
+        return None if self.development else self.firmware_version
+
+    @property
+    def firmware(self) -> str:
+        """In words."""
+        if self.firmware_version is None:
+            return "of unknown version"
+        return ".".join(map(str, self.firmware_version)) + (" (dev build)" if self.development else "")
 
 
 @dataclass(frozen=True, slots=True)
