@@ -66,11 +66,10 @@ def is_served(link: AutopilotLink, fake: FakeAutopilot) -> bool:
     )
 
 
-def say(link: AutopilotLink, recovery: bool = False) -> None:
+def say(link: AutopilotLink) -> None:
     """One fix of 40 ms ago, and what is said of us."""
     link.send_estimate(
-        VisionEstimate(time.monotonic_ns() - 40_000_000, np.array(POSITION_M), ATTITUDE, COVARIANCE, 7, 0.8, PLACE),
-        recovery,
+        VisionEstimate(time.monotonic_ns() - 40_000_000, np.array(POSITION_M), ATTITUDE, COVARIANCE, 7, 0.8, PLACE)
     )
     link.report_computer(COMPUTER)
     link.set_system_status(SystemStatus.ACTIVE)

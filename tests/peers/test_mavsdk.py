@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -118,7 +119,12 @@ def test_every_message_for_the_autopilot_as_its_addressee_reads_it(peers_python,
         flown(port, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA, (4, 5, 7)) as fake,
     ):
         wait_for(lambda: is_served(link, fake), 25.0)
-        say(link, recovery=True)
+        say(link)
+        wait_for(lambda: bool(of(fake, "ODOMETRY")), 25.0)
+        # An outage: the next goes by the command, too.
+        began_ns = time.monotonic_ns()
+        wait_for(lambda: time.monotonic_ns() - began_ns > 1_200_000_000, 25.0)
+        say(link)
         wait_for(lambda: all(of(fake, carrier) for carrier in carriers), 25.0)
         frames = [of(fake, carrier)[0] for carrier in carriers]
         heartbeat = of(fake, "HEARTBEAT")[0]
