@@ -234,6 +234,8 @@ class Georeference:
         if system is None:
             return
         most, least = np.linalg.svd(self._true_from_grid(self.anchor), compute_uv=False)
+        if not least > 0.0:
+            raise MapError(f"{name}: {self.anchor} lies outside its domain; rebuild the pack or copy it again")
         if not most / least - 1.0 <= _MAX_ANISOTROPY:
             lon, lat = self._lon_lat([self.anchor[0]], [self.anchor[1]])[0]
             raise MapError(
