@@ -93,8 +93,9 @@ def level_drawn_once(
     if step is None or number < last:
         return step
     cells = products.patches(1)
-    step = self._polished(view, cells, known, step, (level.cell_px / structural._CORRELATED_PX) ** 2)
-    return replace(step, contrast=structural._contrast(view, cells, step.pose))
+    seen = view.points_local(cells.template_px), structural._shown(view, cells.template_px)
+    step = self._polished(view, cells, *seen, known, step, (level.cell_px / structural._CORRELATED_PX) ** 2)
+    return replace(step, contrast=structural._contrast(view, cells, *seen, step.pose))
 
 
 def variants() -> Iterator[Variant]:

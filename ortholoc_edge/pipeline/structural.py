@@ -439,12 +439,21 @@ class Tracking:
             if step is None or number < len(self._tuning.levels) - 1:
                 return step
             cells = products.patches(1)
+            points, shown = view.points_local(cells.template_px), _shown(view, cells.template_px)
             if self._tuning.polish:
-                step = self._polished(view, cells, known, step, (level.cell_px / _CORRELATED_PX) ** 2)
-            return replace(step, contrast=_contrast(view, cells, step.pose))
+                samples = (level.cell_px / _CORRELATED_PX) ** 2
+                step = self._polished(view, cells, points, shown, known, step, samples)
+            return replace(step, contrast=_contrast(view, cells, points, shown, step.pose))
 
     def _polished(
-        self, view: RenderedView, found: structural.Correlation, known: PoseMeasurement, step: _Step, samples: float
+        self,
+        view: RenderedView,
+        found: structural.Correlation,
+        points: FloatArray,
+        shown: BoolArray,
+        known: PoseMeasurement,
+        step: _Step,
+        samples: float,
     ) -> _Step:
         """The pose at which all cells together fit best, and not only the patches with a peak of their own.
 
@@ -453,10 +462,10 @@ class Tracking:
 
         Args:
             found: of single cells: they share no pixel, and one that shows what has changed spoils no neighbour.
+            points, shown: (N, 3) local m and (N,) of the cells, and whether they show map.
             samples: independent ones of a cell.
         """
         pose = step.pose
-        points, shown = view.points_local(found.template_px), _shown(view, found.template_px)
         for _ in range(_POLISHES):
             shift, jacobian = linearised(points, found.template_px, view.camera, pose)
             score, slope, inside = found.at(np.where(np.isfinite(shift), shift, np.inf))
@@ -659,12 +668,13 @@ def _turns(sigma_rad: float) -> list[float]:
     return [step * k for k in range(-count, count + 1)]
 
 
-def _contrast(view: RenderedView, cells: structural.Correlation, pose: Rigid3) -> float:
+def _contrast(
+    view: RenderedView, cells: structural.Correlation, points: FloatArray, shown: BoolArray, pose: Rigid3
+) -> float:
     """Of all cells that show map, at a pose."""
-    points = view.points_local(cells.template_px)
     shift, _ = linearised(points, cells.template_px, view.camera, pose)
     shift = np.where(np.isfinite(shift), shift, np.inf)
-    return cells.contrast(shift, _shown(view, cells.template_px))
+    return cells.contrast(shift, shown)
 
 
 def _absorbed_error_factor(scores: FloatArray) -> float:
