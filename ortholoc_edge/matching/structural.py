@@ -68,13 +68,18 @@ class Correlation:
         template_px: (N, 2) middles of the patches, px.
         scores: (D, D, N) normalised correlation by shift in y and x, from -radius to radius around ``origin``.
         origin: (x, y) px.
-        sharpness: (N, 2, 2) how fast a patch stops fitting itself, per px^2.
+        own: (5, N) normalised correlation of the patches with themselves at `_OWN_SHIFTS`.
     """
 
     template_px: FloatArray
     scores: Float32Array
     origin: tuple[int, int]
-    sharpness: FloatArray
+    own: Float32Array
+
+    @property
+    def sharpness(self) -> FloatArray:
+        """(N, 2, 2) how fast a patch stops fitting itself, per px^2."""
+        return _sharpness(self.own)
 
     @property
     def radius(self) -> int:
@@ -152,7 +157,7 @@ class Products:
         side = 2 * self.radius + 1
         if min(self.volume.shape[1:]) < count:
             empty = np.empty((side, side, 0), np.float32)
-            return Correlation(np.empty((0, 2)), empty, self.origin, np.empty((0, 2, 2)))
+            return Correlation(np.empty((0, 2)), empty, self.origin, np.empty((len(_OWN_SHIFTS), 0), np.float32))
         scores = _patches(self.volume, count, stride)
         self_scores = _patches(self.own, count, stride)
         fixed_energy = np.maximum(self_scores[0], _MIN_ENERGY)
@@ -164,7 +169,7 @@ class Products:
             np.column_stack([x.ravel(), y.ravel()]),
             scores.reshape(side, side, -1),
             self.origin,
-            _sharpness((self_scores / fixed_energy).reshape(len(_OWN_SHIFTS), -1)),
+            (self_scores / fixed_energy).reshape(len(_OWN_SHIFTS), -1),
         )
 
 

@@ -465,13 +465,13 @@ class Tracking:
             points, shown: (N, 3) local m and (N,) of the cells, and whether they show map.
             samples: independent ones of a cell.
         """
-        pose = step.pose
+        pose, sharpness = step.pose, found.sharpness
         for _ in range(_POLISHES):
             shift, jacobian = linearised(points, found.template_px, view.camera, pose)
             score, slope, inside = found.at(np.where(np.isfinite(shift), shift, np.inf))
             score = np.where(inside & shown, np.clip(score, 0.0, _MAX_SCORE), 0.0)
             strength = samples * score / (1.0 - score**2)
-            stiffness = (strength * score)[:, None, None] * found.sharpness
+            stiffness = (strength * score)[:, None, None] * sharpness
             normal, _ = normal_equations(jacobian, stiffness, np.zeros_like(shift))
             rise = (strength[:, None] * slope).ravel() @ jacobian.reshape(-1, 6)
             normal += known.information
