@@ -107,9 +107,11 @@ _MAX_TURNS = 9
 # Heights are tried in steps of this factor: half of it is what the first level's radius bears at the rim.
 _ZOOM = 1.2
 _MAX_ZOOMS = 7
-_PEAKS_PER_TURN = 3
+_PEAKS_PER_TURN = 5
 _IMPROBABLE = 0.2
 _CANDIDATES = 6
+# If they lead nowhere, so many are drawn anew, and so many of these followed to the second level.
+_STARTS, _LOOKED_AT_AGAIN = 16, 2
 # Poses that the second level makes the same of: apart by these parts of the height, and by this turn.
 _ALIKE_HEIGHTS, _ALIKE_RAD = 0.015, math.radians(1.0)
 # Support at the level before the last that leaves the other starts untried.
@@ -341,20 +343,56 @@ class Tracking:
         best = None if approach is None else self._arrive(approach)
         if best is not None and best.plausible:
             return best
-        # The last level costs as much as all before it: only the best of the starts gets there.
-        approach = None
+        starts = self._search() if proceed() else []
+        for look in (self._likeliest, self._looked_at_again):
+            # The last level costs as much as all before it: only the best of the starts gets there.
+            approach = look(starts, proceed)
+            found = None if approach is None else self._arrive(approach)
+            if found is not None and (best is None or found.inliers > best.inliers):
+                best = found
+            if best is not None and best.plausible:
+                break
+        return best
+
+    def _likeliest(self, starts: Sequence[Rigid3], proceed: Callable[[], bool]) -> list[_Step] | None:
+        """The approach with the most support from the first starts; the first with enough of it ends the search."""
+        best: list[_Step] | None = None
         seen: list[Rigid3] = []
-        for start in self._search() if proceed() else []:
+        for start in starts[:_CANDIDATES]:
             if not proceed():
                 break
             another = self._approach(start, seen)
-            if another is not None and (approach is None or another[-1].agree > approach[-1].agree):
-                approach = another
-            if approach is not None and approach[-1].support >= _PROMISING:
+            if another is not None and (best is None or another[-1].agree > best[-1].agree):
+                best = another
+            if best is not None and best[-1].support >= _PROMISING:
                 break
-        found = None if approach is None else self._arrive(approach)
-        if found is not None and (best is None or found.inliers > best.inliers):
-            return found
+        return best
+
+    def _looked_at_again(self, starts: Sequence[Rigid3], proceed: Callable[[], bool]) -> list[_Step] | None:
+        """The same from all starts, each drawn anew before its shift is looked for: a peak far from the prediction is
+        of a view that had little in common with the frame, and its place is but roughly right. Only those that fit best
+        at the first level get to the second."""
+        firsts = []
+        for start in starts:
+            if not proceed():
+                break
+            step = self._level(0, start, self._predicted, look_wide=True)
+            if step is not None:
+                firsts.append(step)
+        firsts.sort(key=lambda step: -float(step.scores[step.inliers].sum()))
+        best: list[_Step] | None = None
+        seen: list[Rigid3] = []
+        for step in firsts:
+            if len(seen) == _LOOKED_AT_AGAIN or not proceed():
+                break
+            if any(self._alike(step.pose, other) for other in seen):
+                continue
+            seen.append(step.pose)
+            another = self._onward(step)
+            if another is not None and (best is None or another[-1].agree > best[-1].agree):
+                best = another
+            if best is not None and best[-1].support >= _PROMISING:
+                break
         return best
 
     def _elsewhere(self, best: Track) -> Track | None:
@@ -393,6 +431,10 @@ class Tracking:
         if step is None or any(self._alike(step.pose, other) for other in seen):
             return None
         seen.append(step.pose)
+        return self._onward(step)
+
+    def _onward(self, step: _Step) -> list[_Step] | None:
+        """From the first level's outcome to the last level but one."""
         steps = [step]
         for number in range(1, len(self._tuning.levels) - 1):
             step = self._level(number, step.pose, self._predicted)
@@ -643,7 +685,7 @@ class Tracking:
                 for _, peak, pose in self._shifted(view, template, field, _PEAKS_PER_TURN):
                     candidates.append((self._merit(peak, pose), pose))
         candidates.sort(key=lambda pair: -pair[0])
-        return [pose for _, pose in candidates[:_CANDIDATES]]
+        return [pose for _, pose in candidates[:_STARTS]]
 
     def _climbs(self, predicted: Rigid3) -> list[float]:
         """Changes of height that cover what the prior allows, m."""

@@ -177,6 +177,17 @@ def test_a_heading_within_the_search_is_found() -> None:
     assert_near(localize(rendered.frame(NADIR), prior), NADIR)
 
 
+@pytest.mark.parametrize(("truth", "error_m"), [(OBLIQUE, (22.0, 0.0, 0.0)), (FLAT, (18.4, 18.4, 0.0))])
+def test_a_place_far_off_the_prediction_is_found_by_looking_again(
+    truth: Rigid3, error_m: tuple[float, float, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """3.5 sigmas: the predicted view has too little in common with the frame to say more than where about."""
+    prior = rendered.prior(truth, error_m, (0.0, 0.0, 0.0), sigma_m=(float(np.hypot(*error_m[:2])) / 3.5, 2.0))
+    assert_near(localize(rendered.frame(truth), prior), truth)
+    monkeypatch.setattr(Tracking, "_looked_at_again", lambda self, starts, proceed: None)
+    assert_rejected(localize(rendered.frame(truth), prior), Reason.LOW_CONTRAST, Reason.FEW_MATCHES)
+
+
 def test_a_sure_prior_is_no_division_by_zero() -> None:
     exact = PosePrior(NADIR, np.zeros((6, 6)))
     outcome = localize(rendered.frame(NADIR), exact)

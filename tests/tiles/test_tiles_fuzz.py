@@ -3,7 +3,7 @@ import os
 from fuzz_builds import fuzz
 
 # More of it: ORTHOLOC_EDGE_FUZZ=2000, or python tests/tiles/fuzz_builds.py 2000
-CASES = int(os.environ.get("ORTHOLOC_EDGE_FUZZ", "150"))
+CASES = int(os.environ.get("ORTHOLOC_EDGE_FUZZ", "80"))
 
 
 def test_damaged_inputs_give_named_errors(tmp_path):
