@@ -315,7 +315,7 @@ class Localizer:
             query = self._query_fields(tracking, grey, trace)
             track = structural.Tracking(query, terrain, prior, self.camera, trace, tracking.tuning).run(start=start)
             return self._structural_fix(frame, track, near, prior, trace)
-        except RejectedError:
+        except (RejectedError, WindowTooLargeError):
             return None
 
     def _track(

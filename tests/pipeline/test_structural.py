@@ -31,7 +31,7 @@ from ortholoc_edge.pipeline.structural import LADDER, TUNING, QueryMaker, Track,
 from ortholoc_edge.pipeline.trace import Trace
 from ortholoc_edge.tiles.georeference import LocalFrame
 from ortholoc_edge.tiles.pack import Pack
-from ortholoc_edge.tiles.store import MapStore
+from ortholoc_edge.tiles.store import MapStore, WindowTooLargeError
 from ortholoc_edge.tiles.window import MapWindow
 
 NADIR = rendered.pose()
@@ -385,6 +385,17 @@ def test_a_refinement_that_fails_leaves_what_features_found(monkeypatch: pytest.
     fix = assert_near(localize(rendered.frame(NADIR), TURNED_AWAY, Structural(acquire=rendered.sift())), NADIR)
     assert fix.adhop_accepted is not None
     assert {"refine", "adhop"} <= set(fix.timings_ms)
+
+
+def test_a_map_window_too_large_to_refine_leaves_what_features_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Tracking, "_best", lambda *_: None)
+
+    def too_large(*_: object) -> None:
+        raise WindowTooLargeError("larger than a read may be")
+
+    monkeypatch.setattr(Tracking, "_from", too_large)
+    fix = assert_near(localize(rendered.frame(NADIR), TURNED_AWAY, Structural(acquire=rendered.sift())), NADIR)
+    assert fix.adhop_accepted is not None
 
 
 def test_features_are_not_asked_where_structure_is_enough() -> None:
