@@ -6,6 +6,8 @@ as MAVLink's ATTITUDE has them.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
@@ -20,13 +22,19 @@ def skew(v: npt.ArrayLike) -> FloatArray:
 
 def exp(rotation_vector_rad: npt.ArrayLike) -> FloatArray:
     """Rotation matrix of a rotation vector (axis times angle, rad)."""
-    v = np.asarray(rotation_vector_rad, dtype=np.float64)
-    angle = float(np.linalg.norm(v))
-    k = skew(v)
+    # By hand, as `to_quaternion`: of so few numbers NumPy's own calls are most of the time.
+    x, y, z = np.asarray(rotation_vector_rad, dtype=np.float64).tolist()
+    angle = math.sqrt(x * x + y * y + z * z)
     if angle < 1e-8:
-        return np.eye(3) + k + 0.5 * (k @ k)
-    return np.asarray(
-        np.eye(3) + np.sin(angle) / angle * k + (1.0 - np.cos(angle)) / angle**2 * (k @ k), dtype=np.float64
+        a, b = 1.0, 0.5
+    else:
+        a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
+    return np.array(
+        [
+            [1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
+            [b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x],
+            [b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)],
+        ]
     )
 
 
@@ -47,21 +55,20 @@ def angle_between(a: npt.ArrayLike, b: npt.ArrayLike) -> float:
 
 def to_quaternion(rotation: npt.ArrayLike) -> FloatArray:
     """Quaternion wxyz of a rotation matrix (Shepperd's method: the largest component first)."""
-    r = np.asarray(rotation, dtype=np.float64)
-    trace = float(np.trace(r))
-    diagonal = np.array([trace, r[0, 0], r[1, 1], r[2, 2]])
-    biggest = int(np.argmax(diagonal))
-    q = np.empty(4)
-    if biggest == 0:
-        q[:] = (1.0 + trace, r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1])
+    r = np.asarray(rotation, dtype=np.float64).tolist()
+    diagonal = r[0][0], r[1][1], r[2][2]
+    trace = sum(diagonal)
+    if trace >= max(diagonal):
+        q = [1.0 + trace, r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1]]
     else:
-        i, j, k = biggest - 1, biggest % 3, (biggest + 1) % 3
-        q[0] = r[k, j] - r[j, k]
-        q[1 + i] = 1.0 + r[i, i] - r[j, j] - r[k, k]
-        q[1 + j] = r[j, i] + r[i, j]
-        q[1 + k] = r[k, i] + r[i, k]
-    q /= np.linalg.norm(q)
-    return -q if q[0] < 0 else q
+        i = diagonal.index(max(diagonal))
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q = [r[k][j] - r[j][k], 0.0, 0.0, 0.0]
+        q[1 + i] = 1.0 + r[i][i] - r[j][j] - r[k][k]
+        q[1 + j] = r[j][i] + r[i][j]
+        q[1 + k] = r[k][i] + r[i][k]
+    norm = math.copysign(math.sqrt(sum(v * v for v in q)), q[0])
+    return np.array(q) / norm
 
 
 def from_quaternion(q_wxyz: npt.ArrayLike) -> FloatArray:

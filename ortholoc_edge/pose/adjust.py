@@ -136,17 +136,15 @@ def linearised(points: FloatArray, px: FloatArray, camera: Camera, pose: Rigid3)
     ahead = z > _MIN_DEPTH_M
     inverse = np.where(ahead, 1.0 / np.where(ahead, z, 1.0), 0.0)
     u, v = x * inverse, y * inverse
-    residuals = np.stack([camera.fx * u + camera.cx - px[:, 0], camera.fy * v + camera.cy - px[:, 1]], axis=1)
+    residuals = np.empty((len(points), 2))
+    residuals[:, 0] = camera.fx * u + (camera.cx - px[:, 0])
+    residuals[:, 1] = camera.fy * v + (camera.cy - px[:, 1])
     residuals[~ahead] = np.inf
     # Rows of R^T are the camera's axes in the map; d(px) = (axis - ratio * optical axis) f / z.
     right, below, along = pose.rotation.T
-    by_point = np.stack(
-        [
-            (camera.fx * inverse)[:, None] * (right - u[:, None] * along),
-            (camera.fy * inverse)[:, None] * (below - v[:, None] * along),
-        ],
-        axis=1,
-    )
+    by_point = np.empty((len(points), 2, 3))
+    by_point[:, 0] = (camera.fx * inverse)[:, None] * (right - u[:, None] * along)
+    by_point[:, 1] = (camera.fy * inverse)[:, None] * (below - v[:, None] * along)
     # d(R^T exp(-d) (P - C)) = R^T skew(P - C) d, and a row r times skew(p) is r x p.
     jacobian = np.empty((len(points), 2, 6))
     jacobian[:, :, :3] = -by_point

@@ -211,8 +211,8 @@ def test_timesync_is_answered_under_a_flood():
 def test_full_write_buffer_on_tcp_drops_and_goes_on():
     """A peer that does not read: what the kernel takes no more is dropped and counted, and hearing goes on."""
     with socket.create_server(("127.0.0.1", 0)) as server:
-        # Before the connection is there: a window made smaller afterwards leaves the link's acknowledgements outside it,
-        # and then nothing gets through either way until the kernel has tried again for many seconds.
+        # Before the connection is there: a window made smaller afterwards leaves the link's acknowledgements outside
+        # it, and then nothing gets through either way until the kernel has tried again for many seconds.
         server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         link = AutopilotLink(LinkOptions(endpoint=f"tcp:127.0.0.1:{server.getsockname()[1]}"), SystemClock())
         with link:

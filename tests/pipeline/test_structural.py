@@ -177,7 +177,10 @@ def test_a_heading_within_the_search_is_found() -> None:
     assert_near(localize(rendered.frame(NADIR), prior), NADIR)
 
 
-@pytest.mark.parametrize(("truth", "error_m"), [(OBLIQUE, (22.0, 0.0, 0.0)), (OBLIQUE, (15.6, -15.6, 0.0)), (FLAT, (0.0, 22.0, 0.0))])
+@pytest.mark.parametrize(
+    ("truth", "error_m"),
+    [(OBLIQUE, (22.0, 0.0, 0.0)), (OBLIQUE, (15.6, -15.6, 0.0)), (FLAT, (0.0, 22.0, 0.0))],
+)
 def test_a_place_far_off_the_prediction_is_found_by_looking_again(
     truth: Rigid3, error_m: tuple[float, float, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
