@@ -456,54 +456,6 @@ class _Builder:
         self.colour((rows, columns), body, car.colour)
         self.colour((rows, columns), body & glass, (34, 38, 44))
 
-    def light(self) -> Float32Array:
-        """(H, W) share of the sun's light that arrives, 1 on open flat ground."""
-        g = self.spec.gsd_m
-        east, north, up = self.epoch.sun
-        gx: AnyFloats = cv2.Sobel(self.surface, cv2.CV_32F, 1, 0, ksize=1, scale=0.5 / g).astype(np.float32, copy=False)
-        gy: AnyFloats = cv2.Sobel(self.surface, cv2.CV_32F, 0, 1, ksize=1, scale=-0.5 / g).astype(
-            np.float32, copy=False
-        )
-        lit = np.float32(up) - gx * np.float32(east) - gy * np.float32(north)
-        gx *= gx
-        gy *= gy
-        gx += gy
-        gx += 1.0
-        lit /= np.sqrt(gx)
-        lit *= np.float32(1.0 / up)
-        np.clip(lit, 0.0, 1.35, out=lit)
-        lit *= 1.0 - self.shadow()
-        return np.asarray(lit, dtype=np.float32)
-
-    def shadow(self) -> Float32Array:
-        """(H, W) 0 in the sun, 1 in shade cast by something between the pixel and the sun.
-
-        The highest obstacle along the ray, max over t of (height(p + t) - t * slope), is found by doubling the
-        length seen: seven shifts for 64 m.
-        """
-        g = self.spec.gsd_m
-        east, north, up = self.epoch.sun
-        flat = float(np.hypot(east, north))
-        slope = up / flat
-        seen = self.surface.copy()
-        step = 1
-        while step * g < 40.0:
-            dx, dy = step * east / flat, -step * north / flat
-            ix, iy = round(dx), round(dy)
-            drop = np.float32(np.hypot(ix, iy) * g * slope)
-            rows, columns = seen.shape
-            to = seen[max(0, -iy) : rows - max(0, iy), max(0, -ix) : columns - max(0, ix)]
-            source = seen[max(0, iy) : rows - max(0, -iy), max(0, ix) : columns - max(0, -ix)] - drop
-            seen_next = seen.copy()
-            np.maximum(to, source, out=seen_next[max(0, -iy) : rows - max(0, iy), max(0, -ix) : columns - max(0, ix)])
-            seen = seen_next
-            step *= 2
-        seen -= self.surface
-        seen -= 0.05
-        seen *= 4.0  # the penumbra: a quarter of a metre
-        np.clip(seen, 0.0, 1.0, out=seen)
-        return np.asarray(cv2.blur(seen, (3, 3)), dtype=np.float32)
-
     def shade(self) -> Float32Array:
         """(H, W) factor on all channels: soil, rows, wheel tracks, grain."""
         world, epoch, spec, g = self.world, self.epoch, self.spec, self.spec.gsd_m
@@ -546,7 +498,7 @@ class _Builder:
         epoch, g = self.epoch, self.spec.gsd_m
         paint = self.world.paint.astype(np.float32) * np.float32(0.8 / 255)
         paint[self.objects > 0] = 0.0
-        shade, lit = self.shade(), self.light()
+        shade, lit = self.shade(), sunlight(self.surface, g, epoch.sun)
         tint = octaves(self.spec.shape, (12.0 / g, 45.0 / g), (0.6, 1.0), self.spec.seed + 70)
         tint += np.float32(0.6) * blobs(self.spec.shape, 30.0 / g, epoch.seed + 71)
         tint *= self.per_cover({**dict.fromkeys(_FIXED_COLOURS, 0.0), Cover.WATER: 0.0}, epoch.tint)
@@ -564,6 +516,54 @@ class _Builder:
             value *= np.float32(epoch.gain[channel])
             out[..., channel] = np.clip(value, 0, 255, out=value)
         return out
+
+
+def sunlight(surface: Float32Array, gsd_m: float, sun: FloatArray) -> Float32Array:
+    """(H, W) share of the sun's light that arrives, 1 on open flat ground."""
+    g = gsd_m
+    east, north, up = sun
+    gx: AnyFloats = cv2.Sobel(surface, cv2.CV_32F, 1, 0, ksize=1, scale=0.5 / g).astype(np.float32, copy=False)
+    gy: AnyFloats = cv2.Sobel(surface, cv2.CV_32F, 0, 1, ksize=1, scale=-0.5 / g).astype(np.float32, copy=False)
+    lit = np.float32(up) - gx * np.float32(east) - gy * np.float32(north)
+    gx *= gx
+    gy *= gy
+    gx += gy
+    gx += 1.0
+    lit /= np.sqrt(gx)
+    lit *= np.float32(1.0 / up)
+    np.clip(lit, 0.0, 1.35, out=lit)
+    lit *= 1.0 - cast_shadow(surface, g, sun)
+    return np.asarray(lit, dtype=np.float32)
+
+
+def cast_shadow(surface: Float32Array, gsd_m: float, sun: FloatArray) -> Float32Array:
+    """(H, W) 0 in the sun, 1 in shade cast by something between the pixel and the sun.
+
+    The highest obstacle along the ray, max over t of (height(p + t) - t * slope), is found by doubling the
+    length seen: seven shifts for 64 m.
+    """
+    g = gsd_m
+    east, north, up = sun
+    flat = float(np.hypot(east, north))
+    slope = up / flat
+    seen = surface.copy()
+    step = 1
+    while step * g < 40.0:
+        dx, dy = step * east / flat, -step * north / flat
+        ix, iy = round(dx), round(dy)
+        drop = np.float32(np.hypot(ix, iy) * g * slope)
+        rows, columns = seen.shape
+        to = seen[max(0, -iy) : rows - max(0, iy), max(0, -ix) : columns - max(0, ix)]
+        source = seen[max(0, iy) : rows - max(0, -iy), max(0, ix) : columns - max(0, -ix)] - drop
+        seen_next = seen.copy()
+        np.maximum(to, source, out=seen_next[max(0, -iy) : rows - max(0, iy), max(0, -ix) : columns - max(0, ix)])
+        seen = seen_next
+        step *= 2
+    seen -= surface
+    seen -= 0.05
+    seen *= 4.0  # the penumbra: a quarter of a metre
+    np.clip(seen, 0.0, 1.0, out=seen)
+    return np.asarray(cv2.blur(seen, (3, 3)), dtype=np.float32)
 
 
 def base_height(spec: WorldSpec, terrain: Float32Array, house: Building) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.frames import BODY_FROM_NADIR_CAMERA, map_from_ned_rotation
 from ortholoc_edge.geometry.rigid import Rigid3
+from ortholoc_edge.pose import pnp
 
 CLEAN = Sensor(noise=0.0, blur_px=0.0, vignetting=0.0, jpeg_quality=0)
 PLACE = Placement(1000.0, 5000.0, 0.9998)
@@ -105,6 +108,59 @@ def test_roof_outlines_are_where_their_corners_project(renderer: Renderer, fligh
         assert outside.sum() < 0.05 * expected.sum()
         checked += 1
     assert checked >= 2
+
+
+@pytest.mark.parametrize("view_pose", POSES)
+def test_dots_on_the_ground_are_seen_where_they_project(flight: Scene, view_pose: Rigid3) -> None:
+    """Painted on the texture at known places, found in the picture as spots of light."""
+    grid, spec = flight.spec.grid, flight.spec
+    texture = np.zeros_like(flight.texture)
+    rng = np.random.default_rng(3)
+    at = rng.uniform((20, 20), (spec.width_m - 20, spec.height_m - 20), (1500, 2))
+    columns, rows = np.round(grid.px_from_map(at)).astype(int).T
+    on_ground = flight.objects[rows, columns] == 0
+    columns, rows = columns[on_ground], rows[on_ground]
+    for column, row in zip(columns, rows, strict=True):
+        # As large as three of the picture's pixels.
+        cv2.circle(texture, (int(column), int(row)), 2, (255, 255, 255), -1)
+    image = Renderer(replace(flight, texture=texture), PLACE, CLEAN).render(CAMERA, view_pose)[..., 0]
+    points = np.column_stack(
+        [
+            PLACE.west_m + (columns + 0.5) * spec.gsd_m,
+            PLACE.south_m + spec.height_m - (rows + 0.5) * spec.gsd_m,
+            flight.surface[rows, columns],
+        ]
+    )
+    errors = []
+    y, x = np.mgrid[:17, :17]
+    for u, v in projected(CAMERA, view_pose, points):
+        if not (9 <= u < CAMERA.width - 9 and 9 <= v < CAMERA.height - 9):
+            continue
+        left, top = round(u) - 8, round(v) - 8
+        patch = image[top : top + 17, left : left + 17].astype(float)
+        rim = np.concatenate([patch[[0, -1]].ravel(), patch[:, [0, -1]].ravel()])
+        if patch.max() < 80 or rim.any() or cv2.connectedComponents((patch > 40).astype(np.uint8))[0] != 2:
+            continue  # behind something, or two in one
+        seen = np.array([(patch * x).sum() + left * patch.sum(), (patch * y).sum() + top * patch.sum()]) / patch.sum()
+        errors.append(seen - (u, v))
+    assert len(errors) >= 20
+    off = np.linalg.norm(errors, axis=1)
+    assert np.median(off) < 0.2
+    # A dot at a wall's or a crown's foot is cut.
+    assert np.percentile(off, 90) < 0.5
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.1
+
+
+@pytest.mark.parametrize("view_pose", POSES)
+def test_its_own_truth_as_matches_gives_the_pose_to_millimetres(renderer: Renderer, view_pose: Rigid3) -> None:
+    view = renderer.view(CAMERA, view_pose)
+    u, v = (axis.ravel() for axis in np.meshgrid(np.arange(4, 640, 16), np.arange(4, 480, 16)))
+    points = view.points_map[v, u] - view_pose.translation
+    points[:, :2] /= PLACE.grid_scale
+    found = pnp.solve(points, np.column_stack([u, v]).astype(float), CAMERA, max_error_px=2.0)
+    assert found is not None
+    assert np.linalg.norm(found.local_from_camera.translation) < 0.005
+    assert rotation.angle_between(found.local_from_camera.rotation, view_pose.rotation) < 1e-4
 
 
 def test_nadir_scale_and_orientation(renderer: Renderer, flight: Scene) -> None:
