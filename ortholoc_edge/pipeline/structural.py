@@ -437,12 +437,12 @@ class Tracking:
         """From the first level's outcome to the last level but one."""
         steps = [step]
         for number in range(1, len(self._tuning.levels) - 1):
-            step = self._level(number, step.pose, self._predicted)
-            if step is not None and step.agreeing < self._tuning.repeat_below:
-                step = self._level(number, step.pose, self._predicted)
-            if step is None or step.agreeing < _HOPELESS:
+            found = self._level(number, steps[-1].pose, self._predicted)
+            if found is not None and found.agreeing < self._tuning.repeat_below:
+                found = self._level(number, found.pose, self._predicted)
+            if found is None or found.agreeing < _HOPELESS:
                 return None
-            steps.append(step)
+            steps.append(found)
         return steps
 
     def _alike(self, one: Rigid3, other: Rigid3) -> bool:

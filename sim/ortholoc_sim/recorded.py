@@ -115,7 +115,7 @@ def relit(rgb: ImageArray, valid: BoolArray, lit: Float32Array, gsd_m: float, li
     image *= np.float32(1 / 255)
     image = np.asarray(cv2.pow(image, light.gamma), dtype=np.float32)
     grey = (image @ _LUMA)[..., None]
-    image = grey + (image - grey) * np.float32(light.saturation)
+    image = np.asarray(grey + (image - grey) * np.float32(light.saturation), dtype=np.float32)
     image *= share[..., None] * np.array(light.white, dtype=np.float32)
     image *= np.float32(before / max(float(image.mean()), 1e-6))
     return np.clip(np.round(image), 0, 255).astype(np.uint8)

@@ -145,9 +145,10 @@ def test_dots_on_the_ground_are_seen_where_they_project(flight: Scene, view_pose
         errors.append(seen - (u, v))
     assert len(errors) >= 20
     off = np.linalg.norm(errors, axis=1)
-    assert np.median(off) < 0.2
-    # A dot at a wall's or a crown's foot is cut.
-    assert np.percentile(off, 90) < 0.5
+    assert np.median(off) < 0.1
+    # A dot at a wall's foot is cut, and where one is hidden its neighbour is taken for it.
+    assert (off < 0.5).mean() > 0.8
+    errors = [error for error, length in zip(errors, off, strict=True) if length < 0.5]
     assert np.abs(np.mean(errors, axis=0)).max() < 0.1
 
 
