@@ -450,7 +450,9 @@ class Daemon:
         status = TrackerStatus.TRACK if fresh else self._navigator.tracker.status
         if not fresh and status is TrackerStatus.TRACK:
             status = TrackerStatus.COAST
-        self._link.set_system_status(SystemStatus.ACTIVE if fresh else SystemStatus.STANDBY)
+        # Others hear of what was sent: a fix that nobody is told of, for want of an origin, say, serves nobody.
+        active = self._link.sent_since(now_ns - _FRESH_FIX_NS)
+        self._link.set_system_status(SystemStatus.ACTIVE if active else SystemStatus.STANDBY)
         self._link.report_computer(self._computer.read())
         systemd.notify(f"STATUS={status}, {self._counts['fixes']} fixes, {self._counts['rejected']} rejected")
         if self._link.connected():
@@ -492,7 +494,7 @@ class Daemon:
         switch = self._sources.decide(
             consistency,
             # Not what we know of where we are, but what the autopilot was told: a set without fixes is no position.
-            self._link.estimate_sent_since(now_ns - _FRESH_FIX_NS),
+            self._link.sent_since(now_ns - _FRESH_FIX_NS, local=True),
             vehicle.autopilot if vehicle else None,
             self._link.restarts,
             now_ns,

@@ -1035,13 +1035,35 @@ def test_what_a_filter_said_of_itself_expires():
     assert (stale.estimator_flags, stale.position_test_ratio) == (None, None)
 
 
-def test_an_outage_is_a_second_without_an_estimate_and_not_the_start():
+def sent(*times_ns, **kinds):
+    """A conversation that sent an estimate at each of these times."""
     protocol = LinkProtocol(LinkOptions(endpoint="udp:x:1"))
-    assert not protocol.is_outage(100 * S)
-    protocol.sent(Outgoing(estimate(100 * S), 100 * S, 0), 100 * S)
-    assert not protocol.is_outage(101 * S) and protocol.is_outage(101 * S + 1)
-    protocol.sent(Outgoing(estimate(102 * S), 102 * S, 0), 102 * S)
-    assert not protocol.is_outage(102 * S), "once"
+    for now in times_ns:
+        protocol.sent(Outgoing(estimate(now), now, 0), now, **{"local": True, **kinds})
+    return protocol
+
+
+def test_an_outage_is_a_second_without_an_estimate_and_not_the_start():
+    assert not sent().is_outage(100 * S)
+    assert not sent(100 * S).is_outage(900 * S), "one estimate has no rhythm"
+    often = sent(100 * S, 100 * S + 100 * MS)
+    assert not often.is_outage(101 * S + 100 * MS) and often.is_outage(101 * S + 100 * MS + 1)
+    often.sent(Outgoing(estimate(102 * S), 102 * S, 0), 102 * S, local=True)
+    assert not often.is_outage(102 * S), "once"
+
+
+def test_slow_fixes_are_no_outages():
+    """Raw at 0.5 Hz: the command would set the filter's position anew with each of them."""
+    protocol = sent(*range(100 * S, 120 * S, 2 * S))
+    assert not protocol.is_outage(118 * S + 4 * S) and protocol.is_outage(118 * S + 6 * S)
+
+
+def test_what_external_nav_gets_is_told_from_the_rest():
+    protocol = sent(100 * S)
+    protocol.sent(Outgoing(estimate(103 * S), 103 * S, 0), 103 * S, local=False)
+    assert protocol.sent_since(101 * S) and not protocol.sent_since(103 * S)
+    assert protocol.sent_since(99 * S, local=True) and not protocol.sent_since(101 * S, local=True)
+    assert not sent().sent_since(0)
 
 
 def test_source_set_is_commanded_until_acknowledged(caplog):

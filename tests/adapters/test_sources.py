@@ -85,6 +85,14 @@ def test_two_sets_are_needed():
         make(switch_sources=True, vision_source_set=1)
 
 
+@pytest.mark.parametrize("send", [("gps_input",), ("global_position_sensor", "gps_input")])
+def test_no_switch_to_a_set_that_nothing_feeds(send):
+    """To a source set all GPS instances are one source, and ExternalNav hears neither of these messages."""
+    with pytest.raises(ValueError, match="add odometry"):
+        make(switch_sources=True, send=send)
+    assert make(switch_sources=True, send=(*send, "odometry")) and make(send=send)
+
+
 def test_command_is_said_until_answered():
     pending = PendingSwitch()
     assert pending.due(0) is None and pending.settle(accepted=True, answer=0) is None
@@ -194,6 +202,14 @@ def test_viso_delay(mode, viso):
 def test_viso_delay_has_a_limit_that_is_told():
     advice = advise(Autopilot.ARDUPILOT, "raw", meter(400.0, 420.0), 250.0, 8 * MS)
     assert advice.viso_delay_ms == 250 and "fast-forward" in advice.note
+
+
+def test_the_default_fixed_latency_is_within_the_limit():
+    """Half a round trip beyond 250 ms is no latency that anybody could lower; 30 ms are."""
+    options = LinkOptions(endpoint="udp:x:1")
+    assert not advise(Autopilot.ARDUPILOT, "fixed-latency", meter(*SPREAD), options.fixed_latency_ms, 8 * MS).note
+    note = advise(Autopilot.ARDUPILOT, "fixed-latency", meter(*SPREAD), 280.0, 8 * MS).note
+    assert "284 ms" in note and "lower fixed_latency_ms" in note
 
 
 @pytest.mark.parametrize("mode", ["fast-forward", "fixed-latency", "raw"])

@@ -108,7 +108,9 @@ def test_a_latency_counts_as_the_release_makes_of_it(
         main(command if release is None else [*command, "--config", configured(tmp_path, release=release)])
         # Half a round trip comes to it.
         assert viso_delay_ms <= fake.parameters["VISO_DELAY_MS"] <= min(viso_delay_ms + 15, 250)
-    capsys.readouterr()
+    text = capsys.readouterr().out
+    assert f'old on arrival, with release = "{release or "fast-forward"}"' in text
+    assert ("assumed for want of --config" in text) == (release is None)
 
 
 def test_px4_is_mended_in_its_own_encoding(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

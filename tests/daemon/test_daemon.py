@@ -30,6 +30,7 @@ from replay import rendered
 from ortholoc_edge.adapters import systemd
 from ortholoc_edge.adapters.bus import AutopilotRecord
 from ortholoc_edge.adapters.camera import CameraOptions, EndOfFrames, FrameSource, open_source
+from ortholoc_edge.adapters.mavlink import SystemStatus
 from ortholoc_edge.clock import SystemClock
 from ortholoc_edge.config import Config, LogOptions, MountOptions
 from ortholoc_edge.daemon import Daemon, LatestSlot
@@ -111,7 +112,10 @@ def test_folder_to_autopilot(folder: Path, peer: tuple[HoveringAutopilot, str], 
     with running(daemon):
         wait_for(lambda: len(autopilot.messages("ODOMETRY")) >= 4, "four ODOMETRY")
         wait_for(lambda: len(autopilot.messages("VISION_POSITION_ESTIMATE")) >= 4, "four VISION_POSITION_ESTIMATE")
-        wait_for(lambda: autopilot.messages("HEARTBEAT"), "a heartbeat")
+        wait_for(
+            lambda: any(m.system_status == SystemStatus.ACTIVE for m in autopilot.messages("HEARTBEAT")),
+            "a heartbeat that says active",
+        )
         wait_for(lambda: any(getattr(o, "reason", None) is Reason.BAD_FRAME for _, o in list(outcomes)), "a bad frame")
     check_estimates(autopilot, outcomes)
     rejected = [outcome for _, outcome in outcomes if isinstance(outcome, Rejected)]
@@ -165,6 +169,7 @@ def test_without_an_origin_nothing_is_sent(folder: Path) -> None:
         autopilot.close()
     assert autopilot.messages("ODOMETRY") == []
     assert autopilot.messages("VISION_POSITION_ESTIMATE") == []
+    assert {m.system_status for m in autopilot.messages("HEARTBEAT")} == {SystemStatus.STANDBY}, "nobody is served"
     assert autopilot.got_counts["SET_GPS_GLOBAL_ORIGIN"] == 0
     assert len(texts) == 1 and "not sent" in texts[0]
 
@@ -431,7 +436,7 @@ def test_recovery_is_told_once_for_each_outage_and_not_at_the_start(folder: Path
         with running(daemon):
             wait_for(lambda: len(autopilot.messages("ODOMETRY")) >= 2, "two ODOMETRY")
             camera.is_covered = True
-            wait_for(lambda: not daemon.link.estimate_sent_since(time.monotonic_ns() - 1_500_000_000), "an outage")
+            wait_for(lambda: not daemon.link.sent_since(time.monotonic_ns() - 1_500_000_000), "an outage")
             before = len(autopilot.messages("ODOMETRY"))
             camera.is_covered = False
             wait_for(lambda: len(autopilot.messages("ODOMETRY")) >= before + 2, "two more")

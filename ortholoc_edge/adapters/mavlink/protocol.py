@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections import Counter, OrderedDict
+from collections import Counter, OrderedDict, deque
 from collections.abc import Callable
+from statistics import median
 
 from ortholoc_edge.adapters.computer import ComputerStatus
 from ortholoc_edge.adapters.mavlink.census import Census, LinkHealth
@@ -52,8 +53,9 @@ _ORIGIN_QUESTIONS = 3
 # The same text is logged once in this time; of this many texts it is known when that was.
 _TEXT_AGAIN_NS = 10 * _S
 _MOST_TEXTS = 256
-# ArduPilot sets its position by command only while its filter has fused none for a second.
-_OUTAGE_NS = 1 * _S
+# ArduPilot sets its position by command only while its filter has fused none for a second. Where estimates usually are
+# rarer, that is no outage but their rhythm: to set the position anew each time would undo all that the filter weighed.
+_OUTAGE_NS, _OUTAGE_RATIO = 1 * _S, 2.5
 
 
 def _repeat_at(rate_hz: float) -> Repeat | None:
@@ -76,7 +78,9 @@ class LinkProtocol:
         self.system_status = SystemStatus.BOOT
         self.computer: ComputerStatus | None = None
         self._last_sent: Outgoing | None = None
-        self.last_sent_ns: int | None = None
+        self._sent_ns: int | None = None
+        self._local_sent_ns: int | None = None
+        self._pauses_ns: deque[int] = deque(maxlen=5)
         self.timesync = TimeSync()
         self.counts: Counter[str] = Counter()
         self.telemetry = Telemetry(
@@ -441,16 +445,27 @@ class LinkProtocol:
 
     def is_outage(self, now_ns: int) -> bool:
         """Whether estimates flowed and none left for so long that ArduPilot takes a new position by command."""
-        return self.last_sent_ns is not None and now_ns - self.last_sent_ns > _OUTAGE_NS
+        if self._sent_ns is None or not self._pauses_ns:
+            return False
+        return now_ns - self._sent_ns > max(_OUTAGE_NS, _OUTAGE_RATIO * median(self._pauses_ns))
 
-    def sent(self, outgoing: Outgoing, now_ns: int) -> None:
-        """An estimate was handed to the line."""
-        self._last_sent, self.last_sent_ns = outgoing, now_ns
+    def sent(self, outgoing: Outgoing, now_ns: int, *, local: bool) -> None:
+        """An estimate was handed to the line. ``local``: by a message that counts from the EKF origin, too."""
+        if self._sent_ns is not None:
+            self._pauses_ns.append(now_ns - self._sent_ns)
+        self._last_sent, self._sent_ns = outgoing, now_ns
+        if local:
+            self._local_sent_ns = now_ns
         if outgoing.repeat == 0:
             self.counts["fixes_sent"] += 1
             self.latency.add(now_ns - outgoing.capture_ns)
         if self._vehicle is not None:
             self.monitor.sent(outgoing.estimate, now_ns, self.state_at, self._vehicle.autopilot)
+
+    def sent_since(self, since_ns: int, *, local: bool = False) -> bool:
+        """See :meth:`AutopilotLink.sent_since`."""
+        sent_ns = self._local_sent_ns if local else self._sent_ns
+        return sent_ns is not None and sent_ns > since_ns
 
     @property
     def fusion(self) -> FusionReport:
