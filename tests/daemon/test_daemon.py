@@ -436,7 +436,7 @@ def test_recovery_is_told_once_for_each_outage_and_not_at_the_start(folder: Path
         with running(daemon):
             wait_for(lambda: len(autopilot.messages("ODOMETRY")) >= 2, "two ODOMETRY")
             camera.is_covered = True
-            wait_for(lambda: not daemon.link.sent_since(time.monotonic_ns() - 1_500_000_000), "an outage")
+            wait_for(lambda: daemon.link._protocol.is_outage(time.monotonic_ns()), "an outage")
             before = len(autopilot.messages("ODOMETRY"))
             camera.is_covered = False
             wait_for(lambda: len(autopilot.messages("ODOMETRY")) >= before + 2, "two more")
