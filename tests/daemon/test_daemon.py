@@ -356,7 +356,7 @@ def test_a_lost_link_is_published(folder: Path) -> None:
     wire = UdpWire()
     autopilot = HoveringAutopilot(wire)
     daemon = Daemon(config(f"folder:{folder}", f"udpout:127.0.0.1:{wire.port}"))
-    bus = daemon._bus = _Bus()  # type: ignore[assignment]
+    bus = daemon._reporter._bus = _Bus()  # type: ignore[assignment]
     try:
         with running(daemon):
             wait_for(lambda: any(record.connected for record in bus.records), "a record of the autopilot")
@@ -696,3 +696,18 @@ def test_slot_wakes_its_taker() -> None:
     taker.join(timeout=5.0)
     assert got == ["frame"]
     assert time.monotonic() - started < 5.0
+
+
+def test_a_defect_of_the_reports_ends_no_flight(folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: Any) -> None:
+    """It would be there again after the restart, and after each."""
+    wire = UdpWire()
+    autopilot = HoveringAutopilot(wire)
+    daemon = Daemon(config(f"folder:{folder}", f"udpout:127.0.0.1:{wire.port}"))
+    monkeypatch.setattr(daemon._reporter._herald, "tell", lambda *_: 1 // 0)
+    try:
+        with running(daemon):
+            wait_for(lambda: daemon.statistics().get("report_errors", 0) >= 2, "two reports")
+            wait_for(lambda: autopilot.messages("ODOMETRY"), "an estimate")
+    finally:
+        autopilot.close()
+    assert caplog.text.count("ZeroDivisionError") == 1
