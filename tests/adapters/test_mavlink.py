@@ -286,8 +286,13 @@ def test_who_speaks_before_the_vehicle_is_known(endpoint, system_id, from_s):
 def test_timesync_request_is_answered_at_once():
     script = Script()
     script.hear(heartbeat())
-    (answer,) = script.hear(dialect.MAVLink_timesync_message(0, 777))
-    assert (answer.tc1, answer.ts1) == (script.now + 5 * MS, 777)
+    question = dialect.MAVLink_timesync_message(0, 777)
+    answer = script.protocol.answer(received(question), 5 * MS)
+    assert (answer.tc1, answer.ts1) == (5 * MS, 777)
+    # Nobody else's question, and no answer's.
+    assert script.protocol.answer(received(question, system=8), 5 * MS) is None
+    assert script.protocol.answer(received(question, component=190), 5 * MS) is None
+    assert script.protocol.answer(received(dialect.MAVLink_timesync_message(1, 777)), 5 * MS) is None
 
 
 @pytest.mark.parametrize("answered", [True, False])

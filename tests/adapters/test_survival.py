@@ -20,7 +20,16 @@ from ortholoc_edge.clock import SystemClock
 
 from .fake_autopilot import FakeAutopilot, PtyWire, TcpWire, UdpWire, Wire
 from .router import GroundStation, Router
-from .test_mavlink import check_attitude, estimate, flying, free_udp_port, good_state, heartbeat, wait_for
+from .test_mavlink import (
+    check_attitude,
+    estimate,
+    flying,
+    free_udp_port,
+    good_state,
+    heartbeat,
+    received,
+    wait_for,
+)
 
 MS = 1_000_000
 
@@ -208,6 +217,32 @@ def test_timesync_is_answered_under_a_flood(caplog):
         assert link.connected() and link.statistics()["reconnects"] == 0
         assert link.statistics()["cut_datagrams"] >= 10
     assert caplog.text.count("more than 4096 bytes is cut") == 1
+
+
+class _Sent:
+    """A transport that keeps what is sent."""
+
+    def __init__(self):
+        self.frames = []
+
+    def send(self, frame):
+        self.frames.append(frame)
+        return True
+
+    def prefer(self, peer):
+        pass
+
+
+def test_timesync_is_answered_while_another_thread_is_asking():
+    """It may be of low priority, and not get on for as long as others compute."""
+    link, line = AutopilotLink(LinkOptions(endpoint="udp:127.0.0.1:1"), SystemClock()), _Sent()
+    link._take_message(line, received(heartbeat()), None, 0)
+    question = received(dialect.MAVLink_timesync_message(0, 777))
+    taking = threading.Thread(target=link._take_message, args=(line, question, None, 5 * MS))
+    with link._lock:
+        taking.start()
+        wait_for(lambda: line.frames)
+    taking.join()
 
 
 def test_full_write_buffer_on_tcp_drops_and_goes_on():

@@ -56,12 +56,11 @@ def flown(
     for tick in range(round(seconds * 50)):
         now = START + tick * S // 50
         out = loop.advance(now)
-        replies = [
-            answer
-            for sent in out
-            for message in from_autopilot.feed(sent.pack(theirs), now)
-            for answer in protocol.on_message(message, now)
-        ]
+        replies = []
+        for sent in out:
+            for message in from_autopilot.feed(sent.pack(theirs), now):
+                protocol.on_message(message, now)
+                replies += filter(None, [protocol.answer(message, now)])
         replies += protocol.poll(now)
         taken = now - round(latency_s * S)
         truth = loop.truth_at(taken)
@@ -72,7 +71,7 @@ def flown(
         outgoing = protocol.release.due(now, protocol.state_at)
         if outgoing is not None:
             replies += protocol.encode_estimate(outgoing.estimate, now)
-            protocol.sent(outgoing, now)
+            protocol.sent(outgoing, now, local=True)
         for reply in replies:
             for answer in loop.receive(from_us.feed(reply.pack(ours), now), now):
                 for message in from_autopilot.feed(answer.pack(theirs), now):
@@ -148,12 +147,11 @@ def test_a_gimbal_on_a_moving_vehicle_is_known_at_the_exposure(site: Site) -> No
     off_deg, bank_deg = [], []
     for tick in range(30 * 50):
         now = START + tick * S // 50
-        replies = [
-            answer
-            for sent in loop.advance(now)
-            for message in from_autopilot.feed(sent.pack(theirs), now)
-            for answer in protocol.on_message(message, now)
-        ]
+        replies = []
+        for sent in loop.advance(now):
+            for message in from_autopilot.feed(sent.pack(theirs), now):
+                protocol.on_message(message, now)
+                replies += filter(None, [protocol.answer(message, now)])
         for reply in replies + protocol.poll(now):
             for answer in loop.receive(from_us.feed(reply.pack(ours), now), now):
                 for message in from_autopilot.feed(answer.pack(theirs), now):

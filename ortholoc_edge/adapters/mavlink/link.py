@@ -537,8 +537,11 @@ class AutopilotLink:
     def _take_message(self, transport: Transport, message: MavlinkMessage, peer: Any, now_ns: int) -> None:
         self._counts["messages"] += 1
         self._counts[f"received_bytes.{message.get_type()}"] += len(message.get_msgbuf())
+        answer = self._protocol.answer(message, now_ns)
+        if answer is not None:
+            self._send(transport, answer)
         with self._lock:
-            answers = self._protocol.on_message(message, now_ns)
+            self._protocol.on_message(message, now_ns)
             vehicle = self._protocol.vehicle
         # Replies go where our autopilot is. Until it was heard, to whoever speaks MAVLink.
         ours = vehicle is not None and message.get_srcSystem() == vehicle.system_id
@@ -547,8 +550,6 @@ class AutopilotLink:
             self._peer_is_vehicle = True
         elif not self._peer_is_vehicle:
             transport.prefer(peer)
-        for answer in answers:
-            self._send(transport, answer)
 
     def _accepts(self, transport: Transport, message: MavlinkMessage, peer: Any) -> bool:
         """Whether a frame's signature lets it count."""

@@ -65,8 +65,8 @@ def _repeat_at(rate_hz: float) -> Repeat | None:
 class LinkProtocol:
     """What is said and asked, and to whom; what was heard of the vehicle is kept by its ``telemetry``.
 
-    Its owner calls :meth:`on_message` for each message that arrives and :meth:`poll` at least every 50 ms,
-    and sends what both return, in order.
+    Its owner calls :meth:`answer` and :meth:`on_message` for each message that arrives and :meth:`poll` at least every
+    50 ms, and sends what they return, in order. :meth:`answer` alone may be called while another thread is in here.
     """
 
     def __init__(
@@ -166,28 +166,41 @@ class LinkProtocol:
 
     # -- in --------------------
 
-    def on_message(self, message: MavlinkMessage, arrival_ns: int) -> list[MavlinkMessage]:
-        """Take in one message; returns what must be answered at once."""
+    def answer(self, message: MavlinkMessage, arrival_ns: int) -> MavlinkMessage | None:
+        """What must be said to a message at once: our time, if our autopilot asks for it.
+
+        It changes nothing and looks at one value only, so that it need not wait until a thread of low priority that
+        asks for a state, say, is done.
+        """
+        vehicle = self._vehicle
+        if vehicle is None or message.get_type() != "TIMESYNC" or message.tc1 != 0:
+            return None
+        if (message.get_srcSystem(), message.get_srcComponent()) != (vehicle.system_id, _AUTOPILOT_COMPONENT):
+            return None
+        return dialect.MAVLink_timesync_message(tc1=arrival_ns, ts1=message.ts1)
+
+    def on_message(self, message: MavlinkMessage, arrival_ns: int) -> None:
+        """Take in one message."""
         system, component = message.get_srcSystem(), message.get_srcComponent()
         name = message.get_type()
         self._census.take(message)
         if system == self.own_system_id and component == self._options.component_id:
             self.counts["own_echo"] += 1
-            return []
+            return
         if name == "HEARTBEAT" and component == _AUTOPILOT_COMPONENT:
             self._on_heartbeat(message, system, arrival_ns)
-            return []
+            return
         if self._vehicle is None or (system, component) != (self._vehicle.system_id, _AUTOPILOT_COMPONENT):
             ours = self._vehicle is not None and system == self._vehicle.system_id
             taken = ours and self.telemetry.take_of_component(message, arrival_ns)
             self.counts[f"received.{name}" if taken else "ignored"] += 1
-            return []
+            return
         self.counts[f"received.{name}"] += 1
         self._census.take_vehicles(name, arrival_ns)
         if name in self._streams:
             self._streams[name].heard(arrival_ns)
         if name == "TIMESYNC" and message.tc1 == 0:
-            return [dialect.MAVLink_timesync_message(tc1=arrival_ns, ts1=message.ts1)]
+            return
         restart = self.telemetry.take(message, arrival_ns)
         if restart is not None:
             self._start_over(restart, arrival_ns)
@@ -196,7 +209,6 @@ class LinkProtocol:
         handler = self._handlers.get(name)
         if handler is not None:
             handler(message, arrival_ns)
-        return []
 
     def is_vehicle_heartbeat(self, message: MavlinkMessage) -> bool:
         """Whether this is the heartbeat of an autopilot that we may serve, not of a ground station or a
