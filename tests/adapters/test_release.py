@@ -204,14 +204,29 @@ def test_yaw_wrong_by_180_is_noticed_by_the_second_fix():
 
 
 def test_one_wild_fix_raises_no_lasting_doubt():
+    """It contradicts the one before it and the one after; five that agree end the doubt."""
     flight = Flight()
     release = make()
-    fixes = regular(flight)
-    fixes[S + 5 * 500 * MS + 300 * MS] = flight.fix(S + 5 * 500 * MS, error=(0.0, 30.0, 0.0))
-    fly(release, flight, 10 * S, fixes)
-    # It contradicts the one before it and the one after; the next ones agree, and the doubt goes.
+    trusted = []
+    for i in range(15):
+        error = (0.0, 30.0 * (i == 5), 0.0)
+        release.take(flight.fix(S + i * 500 * MS, error=error), S + i * 500 * MS + 300 * MS, flight.look)
+        trusted.append(release.displacement_trusted)
     assert release.counts["contradicted"] == 2
-    assert release.displacement_trusted
+    assert trusted == [True] * 6 + [False] * 5 + [True] * 4
+
+
+@pytest.mark.parametrize(("counter", "apart_s"), [(2, 0.5), (1, 6.0)])
+def test_fixes_that_say_nothing_of_the_displacement_are_not_compared(counter, apart_s):
+    """A jump was announced between them; or they are so far apart that odometry may have drifted as much."""
+    flight = Flight()
+    release = make()
+    release.take(flight.fix(S), S + 300 * MS, flight.look)
+    stamp = S + round(apart_s * S)
+    release.take(flight.fix(stamp, error=(0.0, 30.0, 0.0), counter=counter), stamp + 300 * MS, flight.look)
+    assert release.counts["contradicted"] == 0
+    release.take(flight.fix(stamp + S, counter=counter), stamp + S + 300 * MS, flight.look)
+    assert release.counts["contradicted"] == 1, "it can find something"
 
 
 def test_capture_stamps_that_step_are_refused():

@@ -221,6 +221,10 @@ def test_px4_needs_no_delay_where_it_synchronises(mode):
     assert advice.delay_max_ms == {"fast-forward": 10, "fixed-latency": 260, "raw": 230}[mode]
 
 
+def test_the_filter_must_look_back_to_the_fix_that_came_late():
+    assert advise(Autopilot.PX4, "fixed-latency", meter(*SPREAD, 400.0, 400.0), 250.0, 8 * MS).delay_max_ms >= 400
+
+
 @pytest.mark.parametrize(("mode", "delay"), [("fast-forward", 10), ("fixed-latency", 260), ("raw", 180)])
 def test_px4_stamps_by_arrival_on_a_slow_line(mode, delay):
     advice = advise(Autopilot.PX4, mode, meter(*SPREAD), 250.0, 20 * MS)
