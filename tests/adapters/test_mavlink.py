@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from ortholoc_edge.adapters.mavlink import AutopilotLink, LinkOptions, Severity, SystemStatus
+from ortholoc_edge.adapters.mavlink import protocol as protocol_module
 from ortholoc_edge.adapters.mavlink.codec import FrameParser
 from ortholoc_edge.adapters.mavlink.estimates import Autopilot, VisionEstimate
 from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin, Place
@@ -1145,7 +1146,8 @@ def test_hostile_bytes_and_half_frames(kind):
         assert statistics["bad_frames"] > 5 and statistics["reconnects"] == 0
 
 
-def test_nan_attitude_reboot_and_jump_in_flight():
+def test_nan_attitude_reboot_and_jump_in_flight(monkeypatch):
+    monkeypatch.setattr(protocol_module, "_SILENT_AFTER_NS", 1 * S)
     wire = UdpWire()
     autopilot = FakeAutopilot(wire)
     link = AutopilotLink(LinkOptions(endpoint=f"udpout:127.0.0.1:{wire.port}", release="raw"), SystemClock())
