@@ -701,6 +701,19 @@ def test_stopped_and_slow_streams_are_asked_for_again():
     assert 2 <= script.commands(511).count(31) <= 12
 
 
+def test_a_switch_is_not_said_to_an_autopilot_that_comes_back():
+    """It is of the moment."""
+    script = Script()
+    script.run(1.0)
+    script.protocol.source_set.ask(2)
+    assert not script.commands(42007)
+    script.now += 4 * S
+    script.protocol.poll(script.now)
+    assert script.protocol.source_set.take_outcome() == Outcome(2, False, None)
+    script.run(3.0)
+    assert not script.commands(42007)
+
+
 def test_silent_autopilot_is_left_alone_and_none_takes_its_place():
     script = Script()
     script.run(2.0)

@@ -9,6 +9,7 @@ import threading
 import time
 
 import numpy as np
+import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from ortholoc_edge.adapters.computer import ComputerStatus
@@ -129,6 +130,17 @@ def test_flight_controller_on_usb_reboots(tmp_path):
     finally:
         link.stop()
         autopilot.close()
+
+
+def test_the_end_of_a_stream_is_an_error():
+    """Readable for ever without a byte: the thread, which runs before all others, would read and read."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        transport = open_transport(parse_endpoint(f"tcp:127.0.0.1:{server.getsockname()[1]}"))
+        server.accept()[0].close()
+        select.select([transport], [], [], 5.0)
+        with pytest.raises(ConnectionError, match="closed by the other side"):
+            transport.receive()
+        transport.close()
 
 
 def test_who_hangs_up_at_once_is_called_more_and_more_seldom():
