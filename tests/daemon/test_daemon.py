@@ -34,7 +34,7 @@ from ortholoc_edge.adapters.mavlink import SystemStatus
 from ortholoc_edge.clock import SystemClock
 from ortholoc_edge.config import Config, LogOptions, MountOptions
 from ortholoc_edge.daemon import Daemon, LatestSlot
-from ortholoc_edge.errors import MapError, OrtholocError
+from ortholoc_edge.errors import CameraError, LinkError, MapError, OrtholocError
 from ortholoc_edge.geometry import frames, rotation
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.frame import Frame
@@ -559,6 +559,25 @@ def test_a_camera_in_a_gimbal(tmp_path: Path) -> None:
         assert math.degrees(rotation.angle_between(turn, BankedAutopilot.ATTITUDE)) < 1.5
         # The camera is 1.7 m from the body.
         assert np.linalg.norm(np.array([message.x, message.y, message.z]) - TRUE_NED) < 1.0
+
+
+class _BrokenCamera:
+    def read(self, timeout_s: float) -> Frame | None:
+        raise ZeroDivisionError("a driver's")
+
+    def close(self) -> None:
+        pass
+
+
+def test_a_camera_or_a_link_that_ended_for_good_ends_the_daemon(folder: Path) -> None:
+    """For systemd to start it afresh: without either there is nothing left to do."""
+    options = config(f"folder:{folder}", "udpout:127.0.0.1:9")
+    with pytest.raises(CameraError, match="a driver's"):
+        Daemon(options, frames=_BrokenCamera()).run(threading.Event())
+    daemon = Daemon(options)
+    daemon.link.failure = ZeroDivisionError("ours")
+    with pytest.raises(LinkError, match="ours"):
+        daemon.run(threading.Event())
 
 
 class _BrokenMatcher:

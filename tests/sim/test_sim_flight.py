@@ -115,7 +115,7 @@ def test_as_ardupilot_stamps_only_fast_forward_holds_it(site: Site) -> None:
     assert carried_m < 0.9
     assert raw_m > 2.0 * carried_m
     assert protocol.release.displacement_trusted
-    assert protocol.fusion.state is Fusion.FUSED
+    assert protocol.monitor.report.state is Fusion.FUSED
     advice = protocol.delay_advice()
     assert advice is not None and advice.viso_delay_ms == 0
 
@@ -123,9 +123,9 @@ def test_as_ardupilot_stamps_only_fast_forward_holds_it(site: Site) -> None:
 def test_the_monitor_tells_standby_from_fused(site: Site) -> None:
     """While GNSS is in use nothing shows whose the position is; after it, the position is at the fixes."""
     _, protocol = flown(site, 9.5, estimates=True, release="fast-forward")
-    assert protocol.fusion.state is Fusion.UNKNOWN
+    assert protocol.monitor.report.state is Fusion.UNKNOWN
     _, protocol = flown(site, 25.0, estimates=True, release="fast-forward")
-    assert protocol.fusion.state is Fusion.FUSED
+    assert protocol.monitor.report.state is Fusion.FUSED
 
 
 def test_without_estimates_it_drifts_off(site: Site) -> None:

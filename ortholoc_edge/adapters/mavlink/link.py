@@ -236,7 +236,7 @@ class AutopilotLink:
     def fusion(self) -> FusionReport:
         """What the autopilot's filter does with our fixes."""
         with self._lock:
-            return self._protocol.fusion
+            return self._protocol.monitor.report
 
     @property
     def delay_advice(self) -> DelayAdvice | None:

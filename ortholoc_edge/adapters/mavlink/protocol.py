@@ -15,7 +15,7 @@ from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin
 from ortholoc_edge.adapters.mavlink.gimbal import GimbalSelection
 from ortholoc_edge.adapters.mavlink.latency import Ages, DelayAdvice, LatencyMeter, advise, ages_of
 from ortholoc_edge.adapters.mavlink.log import LimitedLog
-from ortholoc_edge.adapters.mavlink.monitor import FusionMonitor, FusionReport
+from ortholoc_edge.adapters.mavlink.monitor import FusionMonitor
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus, parse_endpoint
 from ortholoc_edge.adapters.mavlink.outlet import Outlet
 from ortholoc_edge.adapters.mavlink.parameters import ParameterClient
@@ -479,10 +479,6 @@ class LinkProtocol:
         sent_ns = self._local_sent_ns if local else self._sent_ns
         return sent_ns is not None and sent_ns > since_ns
 
-    @property
-    def fusion(self) -> FusionReport:
-        return self.monitor.report
-
     def delay_advice(self) -> DelayAdvice | None:
         """What the autopilot should be told of our latency; None before a fix was sent."""
         if self._vehicle is None:
@@ -602,7 +598,7 @@ class LinkProtocol:
         best = self.timesync.best(now_ns)
         round_trip = self.timesync.last_round_trip_ns
         vehicle = self._vehicle
-        advice = self.delay_advice()
+        advice, fusion = self.delay_advice(), self.monitor.report
         return {
             **self.counts,
             **{f"release.{name}": count for name, count in self.release.counts.items()},
@@ -610,9 +606,9 @@ class LinkProtocol:
             "latency_median_ms": self.latency.percentile_ms(50.0),
             "latency_p99_ms": self.latency.percentile_ms(99.0),
             "delay_advice": None if advice is None else str(advice),
-            "fusion": self.fusion.state.value,
-            "fusion_since_s": (now_ns - self.fusion.since_ns) / _S if self.fusion.since_ns else None,
-            "fusion_reason": self.fusion.reason,
+            "fusion": fusion.state.value,
+            "fusion_since_s": (now_ns - fusion.since_ns) / _S if fusion.since_ns else None,
+            "fusion_reason": fusion.reason,
             "connected": self.connected(now_ns),
             "autopilot": vehicle.autopilot.value if vehicle else None,
             "vehicle_system_id": vehicle.system_id if vehicle else None,
