@@ -457,9 +457,8 @@ class LinkProtocol:
 
     def is_outage(self, now_ns: int) -> bool:
         """Whether estimates flowed and none left for so long that ArduPilot takes a new position by command."""
-        if self._sent_ns is None or not self._pauses_ns:
-            return False
-        return now_ns - self._sent_ns > max(_OUTAGE_NS, _OUTAGE_RATIO * median(self._pauses_ns))
+        usual_ns = median(self._pauses_ns or (0,))
+        return self._sent_ns is not None and now_ns - self._sent_ns > max(_OUTAGE_NS, _OUTAGE_RATIO * usual_ns)
 
     def sent(self, outgoing: Outgoing, now_ns: int, *, local: bool) -> None:
         """An estimate was handed to the line. ``local``: by a message that counts from the EKF origin, too."""
