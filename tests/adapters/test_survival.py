@@ -7,6 +7,7 @@ import select
 import socket
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from ortholoc_edge.adapters.computer import ComputerStatus
 from ortholoc_edge.adapters.mavlink import AutopilotLink, LinkOptions, Severity
 from ortholoc_edge.adapters.mavlink import link as link_module
+from ortholoc_edge.adapters.mavlink.geodesy import Place
 from ortholoc_edge.adapters.mavlink.options import parse_endpoint
 from ortholoc_edge.adapters.mavlink.transport import open_transport
 from ortholoc_edge.clock import SystemClock
@@ -243,6 +245,19 @@ class _Sent:
 
     def prefer(self, peer):
         pass
+
+    def pending(self):
+        return False
+
+
+@pytest.mark.parametrize(("send", "is_local"), [("gps_input", False), ("odometry", True)])
+def test_what_external_nav_hears_is_told_from_what_left_the_link(send, is_local):
+    link, line = AutopilotLink(LinkOptions(endpoint="udp:x:1", send=(send,), release="raw"), SystemClock()), _Sent()
+    link._take_message(line, received(heartbeat()), None, time.monotonic_ns())
+    link.send_estimate(replace(estimate(time.monotonic_ns()), place=Place(50.0, 7.0, 100.0)))
+    assert not link.sent_since(0)
+    link._say(line)
+    assert link.sent_since(0) and link.sent_since(0, local=True) is is_local
 
 
 def test_timesync_is_answered_while_another_thread_is_asking():

@@ -180,10 +180,14 @@ def test_wrong_settings_are_told_once(folder: Path, caplog: pytest.LogCaptureFix
     wire = UdpWire()
     autopilot = HoveringAutopilot(wire)
     autopilot.parameters = dict(ARDUPILOT_STOCK)
-    daemon = Daemon(config(f"folder:{folder}", f"udpout:127.0.0.1:{wire.port}"))
+    options = config(f"folder:{folder}", f"udpout:127.0.0.1:{wire.port}")
+    camera = _Covered(open_source(options.camera, SystemClock()))
+    camera.is_covered = True
+    daemon = Daemon(options, frames=camera)
     try:
         with running(daemon):
             wait_for(lambda: len(settings(autopilot)) == 2 and "audit_findings" in daemon.statistics(), "the audit")
+            camera.is_covered = False
             # Sent raw, a fix has the latency that was measured, of which the parameter's default knows nothing.
             wait_for(lambda: "VISO_DELAY_MS is 10, wanted" in caplog.text, "a word about the delay")
             asked, told = autopilot.got_counts["PARAM_REQUEST_READ"], len(autopilot.messages("HEARTBEAT"))
