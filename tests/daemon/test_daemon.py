@@ -5,6 +5,7 @@ The vehicle hovers where the pictures were taken, so that every frame has the sa
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 import os
@@ -42,6 +43,7 @@ from ortholoc_edge.pipeline.navigator import TimingOptions
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.witness import WitnessOptions
 from ortholoc_edge.tiles.georeference import Georeference
+from ortholoc_edge.tiles.pack import Pack
 
 
 @pytest.fixture(scope="module")
@@ -737,3 +739,31 @@ def test_a_defect_of_the_reports_ends_no_flight(folder: Path, monkeypatch: pytes
     finally:
         autopilot.close()
     assert caplog.text.count("ZeroDivisionError") == 1
+
+
+@pytest.mark.parametrize(("changes", "words"), [({"crs": None}, "no reference system"), ({"offsets": None}, "geoid")])
+def test_a_pack_whose_positions_or_heights_mean_nothing_is_refused(
+    changes: dict[str, None], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Heights above the ellipsoid, taken for such above the sea, are 30 to 50 m wrong."""
+    pack = rendered.store().pack
+    silent = msgspec.structs.replace(pack.georeference.vertical, amsl_minus_map_m=None)
+    georeference = dataclasses.replace(pack.georeference, vertical=silent, **changes)
+    monkeypatch.setattr(Pack, "open", lambda *_: dataclasses.replace(pack, georeference=georeference))
+    with pytest.raises(MapError, match=words):
+        Daemon(config("folder:nowhere", "udpout:127.0.0.1:9"))
+
+
+def test_each_life_begins_with_another_reset_counter(folder: Path) -> None:
+    """Else the autopilot would take the first fix after a restart for a jump of the old chain."""
+
+    class Later(SystemClock):
+        def now_ns(self) -> int:
+            return super().now_ns() + 3_000_000_000
+
+    counters = []
+    for clock in (SystemClock(), Later()):
+        daemon = Daemon(config(f"folder:{folder}", "udpout:127.0.0.1:9"), clock=clock)
+        counters.append(daemon._navigator.tracker.reset_counter)
+        daemon._resources.close()
+    assert 2 <= (counters[1] - counters[0]) % 256 <= 5
