@@ -350,3 +350,17 @@ def test_line_with_loss_and_flipped_bits():
         # What passes its checksum is right; what does not is gone, and the rest is found.
         check_attitude(wait_for(lambda: good_state(link, back_ms=400)), autopilot)
         assert link.statistics()["reconnects"] == 0 and link.statistics().get("restarts", 0) == 0
+
+
+def test_without_the_right_to_real_time_priority_it_serves_all_the_same(monkeypatch, caplog):
+    def refuse(*_):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(link_module.os, "sched_setscheduler", refuse)
+    caplog.set_level("INFO")
+    wire = UdpWire()
+    autopilot = FakeAutopilot(wire)
+    link = AutopilotLink(LinkOptions(endpoint=f"udpout:127.0.0.1:{wire.port}"), SystemClock())
+    with flying(link, autopilot):
+        wait_for(link.connected)
+    assert caplog.text.count("no real-time priority (Operation not permitted)") == 1
