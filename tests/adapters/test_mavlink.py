@@ -147,6 +147,15 @@ def test_timesync_ignores_others_and_follows_a_new_clock():
     assert sync.best(now)[0] == 3 * S and sync.resets == 1
 
 
+def test_what_was_known_long_ago_is_known_less():
+    """Crystals drift, by 50 millionths here: a fast answer of a minute ago is worth less than a slower one of now."""
+    sync = TimeSync()
+    sync.answered(S + MS, sync.due(S), S + 2 * MS)
+    assert sync.best(S + 2 * MS) == (0, MS) and sync.best(101 * S + 2 * MS) == (0, 6 * MS)
+    sync.answered(61 * S + 5 * MS, sync.due(61 * S), 61 * S + 4 * MS)
+    assert sync.best(61 * S + 4 * MS) == (3 * MS, 2 * MS)
+
+
 def test_one_wrong_or_late_answer_changes_nothing():
     sync = TimeSync()
 
@@ -542,6 +551,47 @@ def test_stamp_from_the_future_is_dropped():
     script.run(0.1, move=lambda: script.attitude(0.3))
     assert script.protocol.counts["bad_stamps"] == 1 and script.protocol.counts["restarts"] == 0
     assert rotation.to_euler(script.protocol.state_at(script.now).ned_from_body)[2] == pytest.approx(0.3)
+
+
+def turning(rate: float):
+    """A script in which the vehicle turns; what moves it, and by how much an attitude is wrong, None where it is not
+    known."""
+    script = Script()
+
+    def move() -> None:
+        script.attitude(rate * (script.now - 1000 * S) / S, rate=rate)
+
+    def wrong_rad(back_ms: int) -> float | None:
+        stamp = script.now - back_ms * MS
+        attitude = script.protocol.state_at(stamp).ned_from_body
+        truth = rotation.from_euler(0.0, 0.0, rate * (stamp - 1000 * S) / S)
+        return None if attitude is None else rotation.angle_between(attitude, truth)
+
+    return script, move, wrong_rad
+
+
+def test_one_stamp_of_the_future_keeps_none_of_the_present_out():
+    script, move, wrong_rad = turning(0.4)
+    script.run(5.0, move=move)
+    script.attitude(0.0, at=script.now + 500 * MS)
+    script.run(0.3, move=move)
+    assert script.protocol.state_at(script.now - 60 * MS).interpolated and wrong_rad(60) < 1e-2
+    assert script.protocol.counts["out_of_order"] == 0
+
+
+def test_a_clock_put_back_in_a_pause_misdates_nothing():
+    """No stamp goes back, they only come later than ever: until TIMESYNC has answered it may be either."""
+    script, move, wrong_rad = turning(0.4)
+    script.run(12.0, move=move)
+    script.run(0.4)
+    script.offset_ns -= 300 * MS
+    errors, unknown = [], 0
+    for _ in range(100):
+        script.run(0.02, move=move)
+        wrong = [wrong_rad(back_ms) for back_ms in (20, 60, 200, 300, 320)]
+        errors += [error for error in wrong if error is not None]
+        unknown += wrong[1] is None
+    assert max(errors) < 0.4 * 0.05 and 0 < unknown < 50
 
 
 def test_boot_time_comes_round_after_49_days():
