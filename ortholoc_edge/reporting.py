@@ -125,12 +125,10 @@ class Reporter:
         return TrackerStatus.COAST if status is TrackerStatus.TRACK else status
 
     def _report_origin(self, now_ns: int) -> None:
-        since_ns = self._vehicle.no_origin_ns
-        if since_ns is None:
-            self._origin_told_ns = None
-        elif now_ns - since_ns < _FRESH_NS and (
-            self._origin_told_ns is None or now_ns - self._origin_told_ns >= _TELL_AGAIN_NS
-        ):
+        last_ns, told_ns = self._vehicle.no_origin_ns, self._origin_told_ns
+        if last_ns is None or now_ns - last_ns >= _FRESH_NS:
+            return
+        if told_ns is None or now_ns - told_ns >= _TELL_AGAIN_NS:
             self._origin_told_ns = now_ns
             self._link.send_status_text(Severity.WARNING, "OrthoLoC: EKF origin unknown, fixes not sent")
 

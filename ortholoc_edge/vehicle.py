@@ -35,7 +35,7 @@ class Vehicle:
     Counts are added to those of the owner: ``gnss_unusable``, ``no_autopilot``, ``no_origin``.
 
     Attributes:
-        no_origin_ns: when a fix was found last that the autopilot has no origin for; None once it has.
+        no_origin_ns: when a fix was found last that the autopilot had no origin for; None: never.
     """
 
     def __init__(
@@ -121,9 +121,7 @@ class Vehicle:
             return
         map_from_body = fix.map_from_camera @ mount.body_from_camera.inverse()
         local = [sink.local for sink in self._link.sinks]
-        if now.origin is not None:
-            self.no_origin_ns = None
-        elif any(local):
+        if now.origin is None and any(local):
             self._counts["no_origin"] += 1
             self.no_origin_ns = self._clock.now_ns()
             self._offer_origin(map_from_body.translation)

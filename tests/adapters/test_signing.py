@@ -148,7 +148,7 @@ def test_stamps_only_rise_whatever_the_wall_clock_does(steps):
         last = stamp
 
 
-@settings(deadline=None, max_examples=40)  # it writes to a disk
+@settings(deadline=None, max_examples=25)  # it writes to a disk
 @given(lives=st.lists(st.tuples(st.integers(0, 25), st.booleans(), st.integers(-4000, 60)), min_size=1, max_size=6))
 def test_no_stamp_is_used_twice_across_crashes(lives, tmp_path_factory):
     """Each life signs 5 frames a second for some seconds, stores every 10 s, then stops or is killed; the wall clock

@@ -281,6 +281,7 @@ def test_full_write_buffer_on_tcp_drops_and_goes_on():
         link = AutopilotLink(LinkOptions(endpoint=f"tcp:127.0.0.1:{server.getsockname()[1]}"), SystemClock())
         with link:
             connection, _ = server.accept()
+            wait_for(lambda: link._transport)._device.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
             mav = dialect.MAVLink(None, 7, 1)
             beat = bytes(dialect.MAVLink_heartbeat_message(2, 3, 128, 0, 4, 3).pack(mav))
             question = bytes(dialect.MAVLink_timesync_message(0, 5).pack(mav)) * 2000

@@ -73,7 +73,16 @@ def test_hostile_bytes_in_any_pieces():
     assert got > 300
 
 
-def test_command_prints_a_table_or_json(capsys):
+def test_command_prints_a_table_or_json(capsys, monkeypatch):
+    some = link.Spread(count=9, median_ms=0.5, p99_ms=1.5, max_ms=2.0)
+
+    def measure(kind, seconds, load, seed, release):
+        assert (seconds, load, seed) == (0.3, None, 0)
+        return link.Latencies(
+            wire=kind, load="idle", release=release, estimate=some, timesync=some, is_realtime=True, load_fps=0.0
+        )
+
+    monkeypatch.setattr(link, "measure", measure)
     assert main(["bench-link", "--loads", "idle", "--seconds", "0.3"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[2].startswith("| wire |")

@@ -177,8 +177,11 @@ def test_without_an_origin_nothing_is_sent(folder: Path) -> None:
     assert len(texts) == 1 and "not sent" in texts[0]
 
 
-def test_wrong_settings_are_told_once(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_wrong_settings_are_told_once(
+    folder: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The ground station sees which parameter is wrong; the log has the command that mends it."""
+    monkeypatch.setattr("ortholoc_edge.adapters.mavlink.parameters._REQUEST_INTERVAL_NS", 5_000_000)
     wire = UdpWire()
     autopilot = HoveringAutopilot(wire)
     autopilot.parameters = dict(ARDUPILOT_STOCK)
@@ -208,7 +211,9 @@ def settings(autopilot: HoveringAutopilot) -> list[str]:
     return [message.text for message in autopilot.messages("STATUSTEXT") if "wants" in message.text]
 
 
-def test_origin_is_offered_where_that_is_allowed(folder: Path) -> None:
+def test_origin_is_offered_where_that_is_allowed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # How many are waited for is tested beside the protocol.
+    monkeypatch.setattr("ortholoc_edge.adapters.mavlink.protocol._ORIGIN_QUESTIONS", 1)
     wire = UdpWire()
     autopilot = HoveringAutopilot(wire, with_origin=False)
     base = config(f"folder:{folder}", f"udpout:127.0.0.1:{wire.port}")
