@@ -1229,7 +1229,7 @@ def test_nan_attitude_reboot_and_jump_in_flight(monkeypatch):
         assert statistics["restarts"] == 1 and statistics["garbage.ATTITUDE_QUATERNION"] > 5
         autopilot.mute = True
         wait_for(lambda: not link.connected())
-        link.send_estimate(estimate())
+        link.send_estimate(estimate(time.monotonic_ns()))
         wait_for(lambda: link.statistics()["estimates_dropped"] >= 1)
         assert link.fixes_sent == 0, "only what went out counts"
         autopilot.mute = False
