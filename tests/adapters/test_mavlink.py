@@ -18,6 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from ortholoc_edge.adapters.computer import ComputerStatus
 from ortholoc_edge.adapters.mavlink import AutopilotLink, LinkOptions, Severity, SystemStatus
 from ortholoc_edge.adapters.mavlink import protocol as protocol_module
 from ortholoc_edge.adapters.mavlink.codec import FrameParser
@@ -775,7 +776,8 @@ def test_silent_autopilot_is_left_alone_and_none_takes_its_place():
     assert [m.get_type() for at, m in said if at > script.now + 4 * S] == ["HEARTBEAT"] * 6
     script.now += 10 * S
     assert not script.protocol.connected(script.now)
-    assert script.protocol.statistics(script.now)["fusion"] == "unknown"
+    statistics = script.protocol.statistics(script.now)
+    assert (statistics["fusion"], statistics["fusion_reason"]) == ("unknown", "the autopilot is silent")
     # Its neighbour's attitude would be worse than none; a swap on the bench takes a restart of ours.
     script.now += 2 * S
     script.hear(heartbeat(12), system=4)
@@ -1061,7 +1063,7 @@ def test_flight_over_a_real_wire(pair):
         link.send_status_text(Severity.WARNING, "vision: " + "abcdefghij" * 9)
         texts = wait_for(lambda: (t := [m for m in autopilot.got if m.get_type() == "STATUSTEXT"])[1:] and t)
         assert "".join(t.text for t in texts) == "vision: " + "abcdefghij" * 9
-        assert texts[0].id == texts[1].id != 0
+        assert texts[0].id == texts[1].id != 0 and [text.chunk_seq for text in texts] == [0, 1]
         wait_for(lambda: [m for m in autopilot.got if m.get_type() == "HEARTBEAT" and m.system_status == 4])
         # PX4 takes only round trips below 10 ms for its own synchronisation. The fastest shows what the link
         # can do; the rest, what else this machine is busy with.
@@ -1112,6 +1114,23 @@ def test_no_text_of_the_autopilot_hides_another(caplog):
             script.hear(dialect.MAVLink_statustext_message(6, f"text {n}.".encode()))
     assert all(caplog.text.count(f"text {n}.") == 1 for n in range(200))
     assert script.protocol.counts["texts_repeated"] == 200
+    # What goes on is said again, whatever else was said meanwhile.
+    script.now += 6 * S
+    script.hear(dialect.MAVLink_statustext_message(6, b"text 1."))
+    script.now += 5 * S
+    script.hear(dialect.MAVLink_statustext_message(6, b"text 0."))
+    assert caplog.text.count("text 0.") == 2 and caplog.text.count("text 1.") == 1
+    script.hear(dialect.MAVLink_statustext_message(6, b"\x1b[2Jgone"))
+    assert "?[2Jgone" in caplog.text and "\x1b" not in caplog.text, "a radio must not steer a terminal"
+
+
+def test_each_reading_of_the_computer_is_told_once():
+    """Of a worker that hangs, the last one would look alive."""
+    script = Script(computer_status_rate_hz=1.0)
+    script.hear(heartbeat())
+    script.protocol.computer = ComputerStatus((50.0,), 1, 2, (), False, False, False)
+    script.run(5.0)
+    assert [m.get_type() for m in script.said].count("ONBOARD_COMPUTER_STATUS") == 1
 
 
 def test_what_a_filter_said_of_itself_expires():
@@ -1276,7 +1295,7 @@ def test_device_missing_at_start_is_waited_for(tmp_path, caplog):
     with link:
         wait_for(lambda: link.statistics().get("open_failures", 0) >= 2)
         assert link.is_alive() and not link.connected()
-        assert link.state_at(0) is None
+        assert link.state_at(0) is None and "ttyX:57600 is not open" in link.trouble()
         link.send_estimate(estimate())
         link.send_estimate(estimate())
         for i in range(30):
