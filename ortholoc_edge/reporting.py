@@ -108,6 +108,9 @@ class Reporter:
         # Others hear of what was sent: a fix that nobody is told of, for want of an origin, say, serves nobody.
         active = self._link.sent_since(now_ns - _FRESH_NS)
         self._link.set_system_status(SystemStatus.ACTIVE if active else SystemStatus.STANDBY)
+        # First what steers: a defect in what is only told must not keep it from being done.
+        self._switch_sources(self._navigator.tracker.witness.report.state, now_ns)
+        self._report_autopilot(now_ns)
         self._link.report_computer(self._computer.read())
         counts = self._counts
         systemd.notify(f"STATUS={self._status(now_ns)}, {counts['fixes']} fixes, {counts['rejected']} rejected")
@@ -115,7 +118,6 @@ class Reporter:
             self._report_damage()
             self._report_audit(now_ns)
             self._report_origin(now_ns)
-        self._report_autopilot(now_ns)
 
     def _status(self, now_ns: int) -> TrackerStatus:
         """By the age of the last fix, not by what the last frame came to: a camera that hangs gives no frame."""
@@ -133,13 +135,11 @@ class Reporter:
             self._link.send_status_text(Severity.WARNING, "OrthoLoC: EKF origin unknown, fixes not sent")
 
     def _report_autopilot(self, now_ns: int) -> None:
-        """Say and publish what the autopilot does with the fixes and whether GNSS agrees with them; switch its source
-        if that was enabled."""
+        """Say and publish what the autopilot does with the fixes and whether GNSS agrees with them."""
         fusion, witness = self._link.fusion, self._navigator.tracker.witness.report
         for severity, text in self._herald.tell(fusion, witness):
             logger.log(logging.INFO if severity >= Severity.NOTICE else logging.WARNING, "%s", text)
             self._link.send_status_text(severity, text)
-        self._switch_sources(witness.state, now_ns)
         if self._bus is not None:
             self._bus.publish_autopilot(autopilot_record(now_ns, self._link, witness, self._sources.on_vision))
 
