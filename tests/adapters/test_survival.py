@@ -134,6 +134,17 @@ def test_flight_controller_on_usb_reboots(tmp_path):
         autopilot.close()
 
 
+def test_a_line_is_read_by_one_program_only():
+    """Of two, each would get half of every frame."""
+    wire = PtyWire()
+    endpoint = parse_endpoint(f"serial:{wire.path}:921600")
+    first = open_transport(endpoint)
+    with pytest.raises(OSError, match="lock"):
+        open_transport(endpoint)
+    first.close()
+    wire.close()
+
+
 def test_the_end_of_a_stream_is_an_error():
     """Readable for ever without a byte: the thread, which runs before all others, would read and read."""
     with socket.create_server(("127.0.0.1", 0)) as server:
@@ -258,6 +269,26 @@ def test_what_external_nav_hears_is_told_from_what_left_the_link(send, is_local)
     assert not link.sent_since(0)
     link._say(line)
     assert link.sent_since(0) and link.sent_since(0, local=True) is is_local
+
+
+def test_many_senders_do_not_fill_the_memory():
+    link, line = AutopilotLink(LinkOptions(endpoint="udp:x:1"), SystemClock()), _Sent()
+    beat = bytes(heartbeat().pack(dialect.MAVLink(None, 7, 1)))
+    for port in range(50):
+        link._take(line, beat + b"\xfe", ("127.0.0.1", port), port)
+    assert len(link._parsers) == 8 and link.statistics()["messages"] == 50
+
+
+def test_a_defect_that_stays_ends_the_link_and_says_so(monkeypatch):
+    """A daemon without a link serves nobody; systemd starts both afresh."""
+    wire = UdpWire()
+    autopilot = FakeAutopilot(wire)
+    link = AutopilotLink(LinkOptions(endpoint=f"udpout:127.0.0.1:{wire.port}"), SystemClock())
+    monkeypatch.setattr(link._protocol, "poll", lambda now_ns: 1 // 0)
+    with link:
+        wait_for(lambda: not link.is_alive())
+        assert isinstance(link.failure, ZeroDivisionError) and link.statistics()["internal_errors"] == 10
+    autopilot.close()
 
 
 def test_timesync_is_answered_while_another_thread_is_asking():
