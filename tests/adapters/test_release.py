@@ -195,7 +195,7 @@ def test_yaw_wrong_by_180_is_noticed_by_the_second_fix():
             assert outgoing.repeat == 0 and outgoing.estimate.stamp_ns == outgoing.capture_ns
             assert outgoing.estimate.position_ned_m == pytest.approx(flight.truth(outgoing.capture_ns / S))
             # An ArduPilot may take it for now: 10 m/s for 0.3 s.
-            assert outgoing.estimate.covariance[0, 0] >= 0.25 + 3.0**2
+            assert outgoing.estimate.covariance[0, 0] == pytest.approx(0.25 + 3.0**2)
     # Right again, it is believed again.
     flight.reported_velocity = flight.velocity
     later = {k + 20 * S: flight.fix(v.stamp_ns + 20 * S) for k, v in fixes.items()}
@@ -276,6 +276,35 @@ def test_what_waited_for_the_line_too_long_is_dropped(mode):
     assert release.next_ns() is None
     release.take(flight.fix(9 * S), 9 * S + 100 * MS, flight.look)
     assert release.due(9 * S + 990 * MS, flight.look) is not None
+
+
+def test_how_old_a_fix_may_be_is_the_owners_to_say():
+    flight = Flight()
+    for mode, is_sent in (("raw", False), ("fast-forward", False), ("fixed-latency", True)):
+        # Held to an age, it may have that age and a little more.
+        release = Release(LinkOptions(endpoint="udp:x:1", release=mode), max_age_ms=100.0)
+        release.take(flight.fix(S), S + 50 * MS, flight.look)
+        assert (release.due(S + 260 * MS, flight.look) is not None) is is_sent
+
+
+def test_the_owner_is_told_when_to_ask():
+    flight = Flight()
+    for mode, ready, then in (
+        ("raw", 0, None), ("fixed-latency", S + 250 * MS, None), ("fast-forward", 25 * MS, S + 360 * MS),
+    ):  # fmt: skip
+        release = make(release=mode)
+        assert release.next_ns() is None
+        release.take(flight.fix(S), S + 100 * MS, flight.look)
+        assert release.next_ns() == ready
+        assert release.due(S + 260 * MS, flight.look) is not None
+        assert release.next_ns() == then
+
+
+def test_a_fix_before_anything_was_heard_is_as_it_is():
+    release = make()
+    fix = Flight().fix(S)
+    release.take(fix, S + 300 * MS, lambda stamp_ns: None)
+    assert release.due(S + 300 * MS, lambda stamp_ns: None).estimate is fix
 
 
 def test_a_fix_held_to_the_longest_age_is_not_too_old():

@@ -132,6 +132,13 @@ def test_nothing_is_commanded_while_an_answer_is_awaited():
     assert switch.decide(BAD, True, Autopilot.ARDUPILOT, 0, 100 * S, vision_posxy=6) is None and not switch.on_vision
 
 
+def test_an_answer_that_belongs_to_no_command_of_ours_changes_nothing():
+    switch = make(switch_sources=True)
+    assert switch.settle(Outcome(2, True, 0), 0) is None and not switch.on_vision
+    commanded = switch.decide(BAD, True, Autopilot.ARDUPILOT, 0, S, vision_posxy=6)
+    assert switch.settle(Outcome(commanded.number + 1, True, 0), S) is None and not switch.on_vision
+
+
 @pytest.mark.parametrize("posxy", [None, 0, 3])
 def test_no_switch_to_a_set_that_is_not_known_to_be_of_vision(posxy):
     switch = make(switch_sources=True)
