@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -82,6 +84,34 @@ def test_fused_without_gnss():
     assert 2 * S < monitor.report.since_ns < 6 * S
 
 
+def test_where_the_fixes_are_is_fused_though_nothing_moves():
+    monitor = FusionMonitor()
+    assert fly(monitor, Filter(0.0), 10.0, error_m=0.0)[-1][1] is Fusion.FUSED
+
+
+@pytest.mark.parametrize("missing", ["state", "position", "odometry", "epoch", "origin"])
+def test_what_is_not_known_shows_nothing(missing):
+    """A position 5 m off, which would be "ignored"; but nobody knows whether it moves."""
+    flight, monitor = Filter(0.0, off=(4.0, 3.0, 0.0)), FusionMonitor()
+    whole = flight.look
+
+    def look(stamp_ns):
+        # Each answer is looked for 0.7 s after its fix: known at the one, not at the other.
+        state = whole(stamp_ns)
+        if round(stamp_ns / S * 2) % 2 or missing == "position":
+            return {
+                "state": None,
+                "position": replace(state, local_position_ned_m=None),
+                "odometry": replace(state, odometry_ned_m=None),
+                "epoch": replace(state, odometry_epoch=7),
+                "origin": replace(state, origin=None),
+            }[missing]
+        return state
+
+    flight.look = look
+    assert {s for _, s in fly(monitor, flight, 12.0)} == {Fusion.UNKNOWN}
+
+
 def test_on_the_way_to_the_fixes_is_fused():
     """Slowly: 10 % of the way in each half second."""
     monitor = FusionMonitor()
@@ -119,6 +149,8 @@ def test_ratio_above_one_is_refused_and_wavering_does_not_flutter():
     flight, monitor = Filter(0.3), FusionMonitor()
     fly(monitor, flight, 10.0)
     assert monitor.report.state is Fusion.FUSED
+    flight.ratio = 0.9
+    assert {s for _, s in fly(monitor, flight, 3.0, start_s=7.0)} == {Fusion.FUSED}
     flight.ratio = 1.6
     states = fly(monitor, flight, 5.0, start_s=10.0)
     changed = next(t for t, s in states if s is Fusion.REJECTED)
@@ -170,6 +202,8 @@ def test_agreement_of_all_shows_nothing_unless_it_says_so():
     assert fly(monitor, flight, 10.0, gnss_off=(0.5, 0.0, 0.0))[-1][1] is Fusion.UNKNOWN
     monitor.heard("EKF3 IMU0 is using external nav data")
     assert fly(monitor, flight, 5.0, 10.0, gnss_off=(0.5, 0.0, 0.0))[-1][1] is Fusion.FUSED
+    monitor.heard("PreArm: Compass not calibrated")
+    assert fly(monitor, flight, 1.0, 14.0, gnss_off=(0.5, 0.0, 0.0))[-1][1] is Fusion.FUSED
     monitor.heard("EKF3 IMU0 is using GPS")
     assert fly(monitor, flight, 5.0, 15.0, gnss_off=(0.5, 0.0, 0.0))[-1][1] is Fusion.IGNORED
     # What is said of another source set ends what it said before.

@@ -206,6 +206,10 @@ def test_viso_delay(mode, viso):
     assert f"VISO_DELAY_MS = {viso}" in str(advice)
 
 
+def test_without_an_answer_about_time_the_way_counts_for_nothing():
+    assert advise(Autopilot.ARDUPILOT, "fixed-latency", meter(100.0), 200.0, None).viso_delay_ms == 200
+
+
 def test_viso_delay_has_a_limit_that_is_told():
     advice = advise(Autopilot.ARDUPILOT, "raw", meter(400.0, 420.0), 250.0, 8 * MS)
     assert advice.viso_delay_ms == 250 and "fast-forward" in advice.note
@@ -222,7 +226,7 @@ def test_the_default_fixed_latency_is_within_the_limit():
 @pytest.mark.parametrize("mode", ["fast-forward", "fixed-latency", "raw"])
 def test_px4_needs_no_delay_where_it_synchronises(mode):
     advice = advise(Autopilot.PX4, mode, meter(*SPREAD), 250.0, 8 * MS)
-    assert advice.ev_delay_ms == 0
+    assert advice.ev_delay_ms == 0 and "EKF2_EV_DELAY = 0" in str(advice) and "VISO" not in str(advice)
     # But it stamps GLOBAL_POSITION_SENSOR on arrival.
     assert advice.agp_delay_ms == {"fast-forward": 4, "fixed-latency": 254, "raw": 174}[mode]
     assert advice.delay_max_ms == {"fast-forward": 10, "fixed-latency": 260, "raw": 230}[mode]
