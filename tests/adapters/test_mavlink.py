@@ -1116,10 +1116,10 @@ def test_no_text_of_the_autopilot_hides_another(caplog):
     assert script.protocol.counts["texts_repeated"] == 200
     # What goes on is said again, whatever else was said meanwhile.
     script.now += 6 * S
-    script.hear(dialect.MAVLink_statustext_message(6, b"text 1."))
+    script.hear(dialect.MAVLink_statustext_message(6, b"another"))
     script.now += 5 * S
     script.hear(dialect.MAVLink_statustext_message(6, b"text 0."))
-    assert caplog.text.count("text 0.") == 2 and caplog.text.count("text 1.") == 1
+    assert caplog.text.count("text 0.") == 2
     script.hear(dialect.MAVLink_statustext_message(6, b"\x1b[2Jgone"))
     assert "?[2Jgone" in caplog.text and "\x1b" not in caplog.text, "a radio must not steer a terminal"
 

@@ -285,10 +285,12 @@ def test_a_defect_that_stays_ends_the_link_and_says_so(monkeypatch):
     autopilot = FakeAutopilot(wire)
     link = AutopilotLink(LinkOptions(endpoint=f"udpout:127.0.0.1:{wire.port}"), SystemClock())
     monkeypatch.setattr(link._protocol, "poll", lambda now_ns: 1 // 0)
-    with link:
-        wait_for(lambda: not link.is_alive())
-        assert isinstance(link.failure, ZeroDivisionError) and link.statistics()["internal_errors"] == 10
-    autopilot.close()
+    try:
+        with link:
+            wait_for(lambda: not link.is_alive())
+            assert isinstance(link.failure, ZeroDivisionError) and link.statistics()["internal_errors"] == 10
+    finally:
+        autopilot.close()
 
 
 def test_timesync_is_answered_while_another_thread_is_asking():
