@@ -40,12 +40,11 @@ def fly(mode: str, latency_s: float, jitter_s: float, viso_ms: float, seconds: f
     errors, ratios = [], []
     for tick in range(round(seconds * 50)):
         now = _START + tick * _S // 50
-        replies = [
-            answer
-            for sent in loop.advance(now)
-            for message in to_us.feed(sent.pack(theirs), now)
-            for answer in protocol.on_message(message, now)
-        ]
+        replies = []
+        for sent in loop.advance(now):
+            for message in to_us.feed(sent.pack(theirs), now):
+                protocol.on_message(message, now)
+                replies += filter(None, [protocol.answer(message, now)])
         replies += protocol.poll(now)
         truth = loop.truth_at(now - _S // 50)
         if truth is not None and tick % 25 == 0:
@@ -58,7 +57,7 @@ def fly(mode: str, latency_s: float, jitter_s: float, viso_ms: float, seconds: f
         outgoing = protocol.release.due(now, protocol.state_at)
         if outgoing is not None:
             replies += protocol.encode_estimate(outgoing.estimate, now)
-            protocol.sent(outgoing, now)
+            protocol.sent(outgoing, now, local=True)
         for reply in replies:
             for answer in loop.receive(to_it.feed(reply.pack(ours), now), now):
                 for message in to_us.feed(answer.pack(theirs), now):

@@ -54,8 +54,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
                         "the first autopilot heard)")  # fmt: skip
     parser.add_argument("--latency-ms", type=non_negative, metavar="MS", help="what localizing takes, from "
                         "mid-exposure until a fix is there, as the daemon measures it. The delay parameters are held "
-                        "against what [link] release makes of it: about 0 with fast-forward (also without --config), "
-                        "fixed_latency_ms with fixed-latency, this value with raw")  # fmt: skip
+                        "against what [link] release makes of it: about 0 with fast-forward (assumed without --config),"
+                        " fixed_latency_ms with fixed-latency, this value with raw")  # fmt: skip
     parser.add_argument("--fix", action="store_true", help="set the parameters, after a question for each")
     parser.add_argument("--yes", action="store_true", help="with --fix: don't ask")
     parser.add_argument("--json", action="store_true", help="as JSON (default: text)")
@@ -91,12 +91,14 @@ def run(args: argparse.Namespace) -> int:
         # Without either the autopilot may be right for a release that isn't known here.
         ages=lambda: None if config is None and args.latency_ms is None else link.ages(args.latency_ms),
     )  # fmt: skip
+    assumed = "" if config is not None else ", assumed for want of --config"
+    release = f'release = "{options.way_of_release}"{assumed}'
     link.start(open_now=True)
     try:
         _listen(link, checkup, clock, args.timeout)
         situation, findings = checkup.situation(), checkup.findings()
         if not args.json:
-            _print_situation(options.endpoint, situation)
+            _print_situation(options.endpoint, release, situation)
             _print_findings(findings)
         written: list[Written] = []
         if args.fix:
@@ -110,7 +112,7 @@ def run(args: argparse.Namespace) -> int:
                     _print_outcome(written, findings, after)
                 findings = after
         if args.json:
-            print(json.dumps(_facts(options.endpoint, situation, findings, written), indent=2))
+            print(json.dumps(_facts(options, situation, findings, written), indent=2))
     finally:
         link.stop()
     return 1 if any(finding.level is not Level.NOTE for finding in findings) else 0
@@ -195,7 +197,7 @@ def _fix(
 # -- what is printed -----------------------------------------------------------------------------------
 
 
-def _print_situation(endpoint: str, situation: Situation) -> None:
+def _print_situation(endpoint: str, release: str, situation: Situation) -> None:
     health = situation.health
     rows = [("link", endpoint), ("heard", ", ".join(_peers(situation)) or "nobody")]
     if health.vehicle is not None:
@@ -215,6 +217,8 @@ def _print_situation(endpoint: str, situation: Situation) -> None:
         absent = answers.count(Answer.ABSENT)
         text = f"{answers.count(Answer.VALUE)} of {len(answers)} read"
         rows.append(("parameters", text + (f", {absent} not in this firmware" if absent else "")))
+        if situation.ages is not None:
+            rows.append(("delay", f"estimates are {situation.ages.middle_ms:.0f} ms old on arrival, with {release}"))
     width = max(len(name) for name, _ in rows) + 2
     for name, text in rows:
         print(f"{name:<{width}}{text}")
@@ -258,10 +262,12 @@ def _to_reboot(written: list[Written], findings: list[Finding]) -> list[str]:
     return [change.name for change in written if change.accepted and change.name in reboot]
 
 
-def _facts(endpoint: str, situation: Situation, findings: list[Finding], written: list[Written]) -> dict[str, Any]:
+def _facts(
+    options: LinkOptions, situation: Situation, findings: list[Finding], written: list[Written]
+) -> dict[str, Any]:
     health, origin = situation.health, situation.health.origin
     return {
-        "link": endpoint,
+        "link": options.endpoint,
         "autopilot": None if situation.autopilot is None else situation.autopilot.value,
         "firmware": None if situation.firmware is None else ".".join(map(str, situation.firmware)),
         "development_build": health.vehicle is not None and health.vehicle.development,
@@ -271,6 +277,8 @@ def _facts(endpoint: str, situation: Situation, findings: list[Finding], written
         "peers": [asdict(peer) for peer in health.peers],
         "round_trip_ms": health.round_trip_ms,
         "synchronised": health.synchronised,
+        "release": options.way_of_release,
+        "age_ms": None if situation.ages is None else situation.ages.middle_ms,
         "rates_hz": dict(health.rates_hz),
         "wanted_rates_hz": dict(health.wanted_rates_hz),
         "origin": None if origin is None else asdict(origin),

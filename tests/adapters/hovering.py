@@ -77,13 +77,13 @@ def config(source: str, endpoint: str, **more: Any) -> Config:
     # A busy test machine is not what is tested here.
     more.setdefault("timing", TimingOptions(max_age_ms=20_000.0))
     return Config(
-        camera=CameraOptions(source=source, rate_hz=4.0),
+        camera=CameraOptions(source=source, rate_hz=8.0),
         intrinsics=Intrinsics(
             width_px=camera.width, height_px=camera.height, fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy
         ),
         map=MapOptions(pack=str(rendered.store().pack.path)),
         link=LinkOptions(endpoint=endpoint, send=("odometry", "vision_position_estimate"), release="raw"),
-        matcher=MatcherOptions(name="sift", max_keypoints=2048),
+        matcher=MatcherOptions(name="structural"),
         **more,
     )
 

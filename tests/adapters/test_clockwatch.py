@@ -21,6 +21,26 @@ def synchronised(offset_ns: int = 0) -> TimeSync:
     return sync
 
 
+def test_timesync_asks_at_its_pace():
+    """Fast until enough is known, then once a second; in doubt faster than ever, until two answers have settled it."""
+    sync = TimeSync()
+    assert sync.median_round_trip_ns is None
+
+    def asked(start_ns, seconds):
+        times = []
+        for now in range(start_ns, start_ns + round(seconds * S), 10 * MS):
+            ts1 = sync.due(now)
+            if ts1 is not None:
+                times.append(now - start_ns)
+                sync.answered(ts1 + 2 * MS, ts1, ts1 + 4 * MS)
+        return [t // MS for t in times]
+
+    assert asked(S, 4.0) == [*range(0, 1100, 100), 2000, 3000]
+    sync.hurry(5 * S)
+    # The third was due before the second had settled it.
+    assert asked(5 * S, 1.0) == [0, 50, 100] and not sync.hurried
+
+
 def watch(steps, sync=None, start_ns: int = 12 * S):
     """``steps``: (stamp, delay) in ms after the start, of one kind of message each 20 ms."""
     made = ClockWatch(sync or synchronised())

@@ -107,7 +107,8 @@ def test_status_as_the_other_side_reads_it():
 
 def test_quality_as_the_other_side_reads_it():
     covariance = np.diag([4.0, 9.0, 1.0, 0.01, 0.01, 0.01])
-    estimate = VisionEstimate(1_000_000_000, np.zeros(3), np.eye(3), covariance, 0, 0.75)
+    # Carried on to now: its age is that of the frame.
+    estimate = VisionEstimate(1_240_000_000, np.zeros(3), np.eye(3), covariance, 0, 0.75)
     got = {m.name: m.value for m in map(decoded, encode_quality(estimate, 1_000_000_000, 1_250_000_000))}
     assert got == {"VisQuality": 0.75, "VisSigma": pytest.approx(3.0), "VisAge": 0.25}
     assert not any(math.isnan(v) for v in got.values()) and all(len(name) <= 10 for name in got)

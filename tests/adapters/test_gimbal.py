@@ -26,7 +26,6 @@ from ortholoc_edge.adapters.mavlink.geodesy import EarthModel, GeodeticOrigin
 from ortholoc_edge.adapters.mavlink.gimbal import GimbalSelection
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol
 from ortholoc_edge.config import MountOptions
-from ortholoc_edge.daemon import vision_estimate
 from ortholoc_edge.geometry import frames, rotation
 from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.rigid import Rigid3
@@ -35,6 +34,7 @@ from ortholoc_edge.pipeline.frame import CameraMount, VehicleState
 from ortholoc_edge.pipeline.outcome import Reason, Rejected
 from ortholoc_edge.pipeline.prior import PosePrior
 from ortholoc_edge.pipeline.tracker import Tracker, TrackerOptions
+from ortholoc_edge.vehicle import vision_estimate
 
 MS, S = 1_000_000, 1_000_000_000
 IN_VEHICLE, IN_EARTH, LOCKED = 32, 64, 16

@@ -18,7 +18,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from ortholoc_edge.adapters.computer import ComputerStatus
 from ortholoc_edge.adapters.mavlink import AutopilotLink, LinkOptions, Severity, SystemStatus
+from ortholoc_edge.adapters.mavlink import protocol as protocol_module
 from ortholoc_edge.adapters.mavlink.codec import FrameParser
 from ortholoc_edge.adapters.mavlink.estimates import Autopilot, VisionEstimate
 from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin, Place
@@ -144,6 +146,30 @@ def test_timesync_ignores_others_and_follows_a_new_clock():
         now += S
         sync.answered(now + MS + offset, sync.due(now), now + 2 * MS)
     assert sync.best(now)[0] == 3 * S and sync.resets == 1
+
+
+def test_what_was_known_long_ago_is_known_less():
+    """Crystals drift, by 50 millionths here: a fast answer of a minute ago is worth less than a slower one of now."""
+    sync = TimeSync()
+    sync.answered(S + MS, sync.due(S), S + 2 * MS)
+    assert sync.best(S + 2 * MS) == (0, MS) and sync.best(101 * S + 2 * MS) == (0, 6 * MS)
+    sync.answered(61 * S + 5 * MS, sync.due(61 * S), 61 * S + 4 * MS)
+    assert sync.best(61 * S + 4 * MS) == (3 * MS, 2 * MS)
+
+
+def test_one_wrong_or_late_answer_changes_nothing():
+    sync = TimeSync()
+
+    def ask(at, offset_ns=1000 * S, round_trip_ns=2 * MS):
+        sync.answered(at + round_trip_ns // 2 + offset_ns, sync.due(at), at + round_trip_ns)
+
+    ask(S, round_trip_ns=3 * S)
+    assert sync.best(4 * S) is None, "half of 3 s is no knowledge of the time"
+    for i in range(5, 15):
+        ask(i * S)
+    ask(15 * S, offset_ns=1003 * S)
+    ask(16 * S)
+    assert sync.best(17 * S)[0] == 1000 * S and sync.resets == 0
 
 
 def test_history_is_bounded_and_ordered():
@@ -286,8 +312,13 @@ def test_who_speaks_before_the_vehicle_is_known(endpoint, system_id, from_s):
 def test_timesync_request_is_answered_at_once():
     script = Script()
     script.hear(heartbeat())
-    (answer,) = script.hear(dialect.MAVLink_timesync_message(0, 777))
-    assert (answer.tc1, answer.ts1) == (script.now + 5 * MS, 777)
+    question = dialect.MAVLink_timesync_message(0, 777)
+    answer = script.protocol.answer(received(question), 5 * MS)
+    assert (answer.tc1, answer.ts1) == (5 * MS, 777)
+    # Nobody else's question, and no answer's.
+    assert script.protocol.answer(received(question, system=8), 5 * MS) is None
+    assert script.protocol.answer(received(question, component=190), 5 * MS) is None
+    assert script.protocol.answer(received(dialect.MAVLink_timesync_message(1, 777)), 5 * MS) is None
 
 
 @pytest.mark.parametrize("answered", [True, False])
@@ -523,6 +554,47 @@ def test_stamp_from_the_future_is_dropped():
     assert rotation.to_euler(script.protocol.state_at(script.now).ned_from_body)[2] == pytest.approx(0.3)
 
 
+def turning(rate: float):
+    """A script in which the vehicle turns; what moves it, and by how much an attitude is wrong, None where it is not
+    known."""
+    script = Script()
+
+    def move() -> None:
+        script.attitude(rate * (script.now - 1000 * S) / S, rate=rate)
+
+    def wrong_rad(back_ms: int) -> float | None:
+        stamp = script.now - back_ms * MS
+        attitude = script.protocol.state_at(stamp).ned_from_body
+        truth = rotation.from_euler(0.0, 0.0, rate * (stamp - 1000 * S) / S)
+        return None if attitude is None else rotation.angle_between(attitude, truth)
+
+    return script, move, wrong_rad
+
+
+def test_one_stamp_of_the_future_keeps_none_of_the_present_out():
+    script, move, wrong_rad = turning(0.4)
+    script.run(5.0, move=move)
+    script.attitude(0.0, at=script.now + 500 * MS)
+    script.run(0.3, move=move)
+    assert script.protocol.state_at(script.now - 60 * MS).interpolated and wrong_rad(60) < 1e-2
+    assert script.protocol.counts["out_of_order"] == 0
+
+
+def test_a_clock_put_back_in_a_pause_misdates_nothing():
+    """No stamp goes back, they only come later than ever: until TIMESYNC has answered it may be either."""
+    script, move, wrong_rad = turning(0.4)
+    script.run(12.0, move=move)
+    script.run(0.4)
+    script.offset_ns -= 300 * MS
+    errors, unknown = [], 0
+    for _ in range(100):
+        script.run(0.02, move=move)
+        wrong = [wrong_rad(back_ms) for back_ms in (20, 60, 200, 300, 320)]
+        errors += [error for error in wrong if error is not None]
+        unknown += wrong[1] is None
+    assert max(errors) < 0.4 * 0.05 and 0 < unknown < 50
+
+
 def test_boot_time_comes_round_after_49_days():
     script = Script(offset_ns=2**32 * MS - 1003 * S)
 
@@ -669,12 +741,28 @@ def test_stopped_and_slow_streams_are_asked_for_again():
     script.run(3.0, move=lambda: script.attitude(0.0))
     assert script.commands(511).count(31) == 1
     script.said.clear()
-    script.run(5.0)
-    assert 1 <= script.commands(511).count(31) <= 3
+    # After a second of silence, not when the count of some seconds shows it.
+    script.run(1.5)
+    assert script.commands(511).count(31) == 1
+    script.run(3.5)
+    assert script.commands(511).count(31) <= 3
     script.said.clear()
     # 5 Hz is not 50 Hz; it asks, but not without end.
     script.run(60.0, step_ms=200, move=lambda: script.attitude(0.0))
     assert 2 <= script.commands(511).count(31) <= 12
+
+
+def test_a_switch_is_not_said_to_an_autopilot_that_comes_back():
+    """It is of the moment."""
+    script = Script()
+    script.run(1.0)
+    script.protocol.source_set.ask(2)
+    assert not script.commands(42007)
+    script.now += 4 * S
+    script.protocol.poll(script.now)
+    assert script.protocol.source_set.take_outcome() == Outcome(2, False, None)
+    script.run(3.0)
+    assert not script.commands(42007)
 
 
 def test_silent_autopilot_is_left_alone_and_none_takes_its_place():
@@ -682,12 +770,14 @@ def test_silent_autopilot_is_left_alone_and_none_takes_its_place():
     script.run(2.0)
     script.said.clear()
     script.protocol.monitor._report = FusionReport(Fusion.FUSED, script.now, "its position follows the fixes")
-    for _ in range(500):
-        script.now += 20 * MS
-        script.said += script.protocol.poll(script.now)
+    said = [(script.now + i * 20 * MS, message) for i in range(1, 501)
+            for message in script.protocol.poll(script.now + i * 20 * MS)]  # fmt: skip
+    assert {m.get_type() for at, m in said if at < script.now + 2 * S} > {"HEARTBEAT"}
+    assert [m.get_type() for at, m in said if at > script.now + 4 * S] == ["HEARTBEAT"] * 6
+    script.now += 10 * S
     assert not script.protocol.connected(script.now)
-    assert script.protocol.statistics(script.now)["fusion"] == "unknown"
-    assert {m.get_type() for m in script.said[300:]} <= {"HEARTBEAT"}
+    statistics = script.protocol.statistics(script.now)
+    assert (statistics["fusion"], statistics["fusion_reason"]) == ("unknown", "the autopilot is silent")
     # Its neighbour's attitude would be worse than none; a swap on the bench takes a restart of ours.
     script.now += 2 * S
     script.hear(heartbeat(12), system=4)
@@ -973,7 +1063,7 @@ def test_flight_over_a_real_wire(pair):
         link.send_status_text(Severity.WARNING, "vision: " + "abcdefghij" * 9)
         texts = wait_for(lambda: (t := [m for m in autopilot.got if m.get_type() == "STATUSTEXT"])[1:] and t)
         assert "".join(t.text for t in texts) == "vision: " + "abcdefghij" * 9
-        assert texts[0].id == texts[1].id != 0
+        assert texts[0].id == texts[1].id != 0 and [text.chunk_seq for text in texts] == [0, 1]
         wait_for(lambda: [m for m in autopilot.got if m.get_type() == "HEARTBEAT" and m.system_status == 4])
         # PX4 takes only round trips below 10 ms for its own synchronisation. The fastest shows what the link
         # can do; the rest, what else this machine is busy with.
@@ -1024,6 +1114,23 @@ def test_no_text_of_the_autopilot_hides_another(caplog):
             script.hear(dialect.MAVLink_statustext_message(6, f"text {n}.".encode()))
     assert all(caplog.text.count(f"text {n}.") == 1 for n in range(200))
     assert script.protocol.counts["texts_repeated"] == 200
+    # What goes on is said again, whatever else was said meanwhile.
+    script.now += 6 * S
+    script.hear(dialect.MAVLink_statustext_message(6, b"another"))
+    script.now += 5 * S
+    script.hear(dialect.MAVLink_statustext_message(6, b"text 0."))
+    assert caplog.text.count("text 0.") == 2
+    script.hear(dialect.MAVLink_statustext_message(6, b"\x1b[2Jgone"))
+    assert "?[2Jgone" in caplog.text and "\x1b" not in caplog.text, "a radio must not steer a terminal"
+
+
+def test_each_reading_of_the_computer_is_told_once():
+    """Of a worker that hangs, the last one would look alive."""
+    script = Script(computer_status_rate_hz=1.0)
+    script.hear(heartbeat())
+    script.protocol.computer = ComputerStatus((50.0,), 1, 2, (), False, False, False)
+    script.run(5.0)
+    assert [m.get_type() for m in script.said].count("ONBOARD_COMPUTER_STATUS") == 1
 
 
 def test_what_a_filter_said_of_itself_expires():
@@ -1035,13 +1142,35 @@ def test_what_a_filter_said_of_itself_expires():
     assert (stale.estimator_flags, stale.position_test_ratio) == (None, None)
 
 
-def test_an_outage_is_a_second_without_an_estimate_and_not_the_start():
+def sent(*times_ns, **kinds):
+    """A conversation that sent an estimate at each of these times."""
     protocol = LinkProtocol(LinkOptions(endpoint="udp:x:1"))
-    assert not protocol.is_outage(100 * S)
-    protocol.sent(Outgoing(estimate(100 * S), 100 * S, 0), 100 * S)
-    assert not protocol.is_outage(101 * S) and protocol.is_outage(101 * S + 1)
-    protocol.sent(Outgoing(estimate(102 * S), 102 * S, 0), 102 * S)
-    assert not protocol.is_outage(102 * S), "once"
+    for now in times_ns:
+        protocol.sent(Outgoing(estimate(now), now, 0), now, **{"local": True, **kinds})
+    return protocol
+
+
+def test_an_outage_is_a_second_without_an_estimate_and_not_the_start():
+    assert not sent().is_outage(100 * S)
+    assert not sent(100 * S).is_outage(101 * S) and sent(100 * S).is_outage(101 * S + 1)
+    often = sent(100 * S, 100 * S + 100 * MS)
+    assert not often.is_outage(101 * S + 100 * MS) and often.is_outage(101 * S + 100 * MS + 1)
+    often.sent(Outgoing(estimate(102 * S), 102 * S, 0), 102 * S, local=True)
+    assert not often.is_outage(102 * S), "once"
+
+
+def test_slow_fixes_are_no_outages():
+    """Raw at 0.5 Hz: the command would set the filter's position anew with each of them."""
+    protocol = sent(*range(100 * S, 120 * S, 2 * S))
+    assert not protocol.is_outage(118 * S + 4 * S) and protocol.is_outage(118 * S + 6 * S)
+
+
+def test_what_external_nav_gets_is_told_from_the_rest():
+    protocol = sent(100 * S)
+    protocol.sent(Outgoing(estimate(103 * S), 103 * S, 0), 103 * S, local=False)
+    assert protocol.sent_since(101 * S) and not protocol.sent_since(103 * S)
+    assert protocol.sent_since(99 * S, local=True) and not protocol.sent_since(101 * S, local=True)
+    assert not sent().sent_since(0)
 
 
 def test_source_set_is_commanded_until_acknowledged(caplog):
@@ -1099,7 +1228,8 @@ def test_hostile_bytes_and_half_frames(kind):
         assert statistics["bad_frames"] > 5 and statistics["reconnects"] == 0
 
 
-def test_nan_attitude_reboot_and_jump_in_flight():
+def test_nan_attitude_reboot_and_jump_in_flight(monkeypatch):
+    monkeypatch.setattr(protocol_module, "_SILENT_AFTER_NS", 1 * S)
     wire = UdpWire()
     autopilot = FakeAutopilot(wire)
     link = AutopilotLink(LinkOptions(endpoint=f"udpout:127.0.0.1:{wire.port}", release="raw"), SystemClock())
@@ -1118,7 +1248,7 @@ def test_nan_attitude_reboot_and_jump_in_flight():
         assert statistics["restarts"] == 1 and statistics["garbage.ATTITUDE_QUATERNION"] > 5
         autopilot.mute = True
         wait_for(lambda: not link.connected())
-        link.send_estimate(estimate())
+        link.send_estimate(estimate(time.monotonic_ns()))
         wait_for(lambda: link.statistics()["estimates_dropped"] >= 1)
         assert link.fixes_sent == 0, "only what went out counts"
         autopilot.mute = False
@@ -1165,7 +1295,7 @@ def test_device_missing_at_start_is_waited_for(tmp_path, caplog):
     with link:
         wait_for(lambda: link.statistics().get("open_failures", 0) >= 2)
         assert link.is_alive() and not link.connected()
-        assert link.state_at(0) is None
+        assert link.state_at(0) is None and "ttyX:57600 is not open" in link.trouble()
         link.send_estimate(estimate())
         link.send_estimate(estimate())
         for i in range(30):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -66,12 +68,48 @@ def test_silence_ends_what_was_known():
     assert monitor.silent(10 * S).since_ns == 9 * S
 
 
+def test_what_was_seen_before_a_silence_is_not_held_against_what_comes_after():
+    flight, monitor = Filter(0.0), FusionMonitor()
+    monitor.heard("EKF3 IMU0 is using external nav data")
+    assert fly(monitor, flight, 8.0, gnss_off=(0.5, 0.0, 0.0))[-1][1] is Fusion.FUSED
+    monitor.silent(8 * S)
+    assert {s for _, s in fly(monitor, flight, 5.0, 8.5, gnss_off=(0.5, 0.0, 0.0))} == {Fusion.UNKNOWN}
+
+
 def test_fused_without_gnss():
     monitor = FusionMonitor()
     states = fly(monitor, Filter(0.3), 10.0)
     assert states[0][1] is Fusion.UNKNOWN and states[-1][1] is Fusion.FUSED
     assert len({s for _, s in states}) == 2
     assert 2 * S < monitor.report.since_ns < 6 * S
+
+
+def test_where_the_fixes_are_is_fused_though_nothing_moves():
+    monitor = FusionMonitor()
+    assert fly(monitor, Filter(0.0), 10.0, error_m=0.0)[-1][1] is Fusion.FUSED
+
+
+@pytest.mark.parametrize("missing", ["state", "position", "odometry", "epoch", "origin"])
+def test_what_is_not_known_shows_nothing(missing):
+    """A position 5 m off, which would be "ignored"; but nobody knows whether it moves."""
+    flight, monitor = Filter(0.0, off=(4.0, 3.0, 0.0)), FusionMonitor()
+    whole = flight.look
+
+    def look(stamp_ns):
+        # Each answer is looked for 0.7 s after its fix: known at the one, not at the other.
+        state = whole(stamp_ns)
+        if round(stamp_ns / S * 2) % 2 or missing == "position":
+            return {
+                "state": None,
+                "position": replace(state, local_position_ned_m=None),
+                "odometry": replace(state, odometry_ned_m=None),
+                "epoch": replace(state, odometry_epoch=7),
+                "origin": replace(state, origin=None),
+            }[missing]
+        return state
+
+    flight.look = look
+    assert {s for _, s in fly(monitor, flight, 12.0)} == {Fusion.UNKNOWN}
 
 
 def test_on_the_way_to_the_fixes_is_fused():
@@ -95,9 +133,10 @@ def test_dead_reckoning_that_drifts_away_is_ignored():
     assert states[-1][1] is Fusion.IGNORED
 
 
-def test_no_absolute_position_though_fixes_are_sent():
+@pytest.mark.parametrize("flags", [0x01 | 0x02 | 0x04 | 0x20 | 0x80, 0x01 | 0x02 | 0x04 | 0x20, GOOD_FLAGS | 0x80])
+def test_no_absolute_position_though_fixes_are_sent(flags):
     flight = Filter(0.0)
-    flight.flags = 0x01 | 0x02 | 0x04 | 0x20 | 0x80
+    flight.flags = flags
     monitor = FusionMonitor()
     states = fly(monitor, flight, 8.0)
     assert states[-1][1] is Fusion.IGNORED and "no absolute position" in monitor.report.reason
@@ -110,6 +149,8 @@ def test_ratio_above_one_is_refused_and_wavering_does_not_flutter():
     flight, monitor = Filter(0.3), FusionMonitor()
     fly(monitor, flight, 10.0)
     assert monitor.report.state is Fusion.FUSED
+    flight.ratio = 0.9
+    assert {s for _, s in fly(monitor, flight, 3.0, start_s=7.0)} == {Fusion.FUSED}
     flight.ratio = 1.6
     states = fly(monitor, flight, 5.0, start_s=10.0)
     changed = next(t for t, s in states if s is Fusion.REJECTED)
@@ -121,8 +162,11 @@ def test_ratio_above_one_is_refused_and_wavering_does_not_flutter():
 
     states = fly(monitor, flight, 20.0, start_s=15.0, hook=waver)
     assert {s for _, s in states} == {Fusion.REJECTED}
+    # Below the limit, but not so far that it is accepted again.
+    flight.ratio = 0.9
+    assert {s for _, s in fly(monitor, flight, 5.0, start_s=35.0)} == {Fusion.REJECTED}
     flight.ratio = 0.3
-    assert fly(monitor, flight, 8.0, start_s=35.0)[-1][1] is Fusion.FUSED
+    assert fly(monitor, flight, 8.0, start_s=40.0)[-1][1] is Fusion.FUSED
 
 
 def test_a_single_high_ratio_changes_nothing():
@@ -148,11 +192,18 @@ def test_between_fixes_and_gnss(at, expected):
     assert ("relative" in px4.report.reason) == (at == "gnss")
 
 
+def test_a_position_in_the_middle_is_nobodys():
+    monitor = FusionMonitor()
+    assert fly(monitor, Filter(0.0, off=(0.0, 3.0, 0.0)), 12.0, gnss_off=(0.0, 6.0, 0.0))[-1][1] is Fusion.UNKNOWN
+
+
 def test_agreement_of_all_shows_nothing_unless_it_says_so():
     flight, monitor = Filter(0.0), FusionMonitor()
     assert fly(monitor, flight, 10.0, gnss_off=(0.5, 0.0, 0.0))[-1][1] is Fusion.UNKNOWN
     monitor.heard("EKF3 IMU0 is using external nav data")
     assert fly(monitor, flight, 5.0, 10.0, gnss_off=(0.5, 0.0, 0.0))[-1][1] is Fusion.FUSED
+    monitor.heard("PreArm: Compass not calibrated")
+    assert fly(monitor, flight, 1.0, 14.0, gnss_off=(0.5, 0.0, 0.0))[-1][1] is Fusion.FUSED
     monitor.heard("EKF3 IMU0 is using GPS")
     assert fly(monitor, flight, 5.0, 15.0, gnss_off=(0.5, 0.0, 0.0))[-1][1] is Fusion.IGNORED
     # What is said of another source set ends what it said before.
@@ -183,6 +234,12 @@ def test_a_filter_that_says_nothing_yet(flags, reason):
     flight.flags = flags
     assert fly(monitor, flight, 10.0)[-1][1] is Fusion.UNKNOWN
     assert reason in monitor.report.reason
+
+
+def test_the_bit_of_a_filter_that_has_not_started_is_another_one_of_px4s():
+    flight, monitor = Filter(0.3), FusionMonitor()
+    flight.flags = GOOD_FLAGS | 1024
+    assert fly(monitor, flight, 10.0, autopilot=Autopilot.PX4)[-1][1] is Fusion.FUSED
 
 
 def test_gnss_of_the_scene_is_where_it_is_put():

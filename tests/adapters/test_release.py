@@ -195,7 +195,7 @@ def test_yaw_wrong_by_180_is_noticed_by_the_second_fix():
             assert outgoing.repeat == 0 and outgoing.estimate.stamp_ns == outgoing.capture_ns
             assert outgoing.estimate.position_ned_m == pytest.approx(flight.truth(outgoing.capture_ns / S))
             # An ArduPilot may take it for now: 10 m/s for 0.3 s.
-            assert outgoing.estimate.covariance[0, 0] >= 0.25 + 3.0**2
+            assert outgoing.estimate.covariance[0, 0] == pytest.approx(0.25 + 3.0**2)
     # Right again, it is believed again.
     flight.reported_velocity = flight.velocity
     later = {k + 20 * S: flight.fix(v.stamp_ns + 20 * S) for k, v in fixes.items()}
@@ -204,14 +204,29 @@ def test_yaw_wrong_by_180_is_noticed_by_the_second_fix():
 
 
 def test_one_wild_fix_raises_no_lasting_doubt():
+    """It contradicts the one before it and the one after; five that agree end the doubt."""
     flight = Flight()
     release = make()
-    fixes = regular(flight)
-    fixes[S + 5 * 500 * MS + 300 * MS] = flight.fix(S + 5 * 500 * MS, error=(0.0, 30.0, 0.0))
-    fly(release, flight, 10 * S, fixes)
-    # It contradicts the one before it and the one after; the next ones agree, and the doubt goes.
+    trusted = []
+    for i in range(15):
+        error = (0.0, 30.0 * (i == 5), 0.0)
+        release.take(flight.fix(S + i * 500 * MS, error=error), S + i * 500 * MS + 300 * MS, flight.look)
+        trusted.append(release.displacement_trusted)
     assert release.counts["contradicted"] == 2
-    assert release.displacement_trusted
+    assert trusted == [True] * 6 + [False] * 5 + [True] * 4
+
+
+@pytest.mark.parametrize(("counter", "apart_s"), [(2, 0.5), (1, 6.0)])
+def test_fixes_that_say_nothing_of_the_displacement_are_not_compared(counter, apart_s):
+    """A jump was announced between them; or they are so far apart that odometry may have drifted as much."""
+    flight = Flight()
+    release = make()
+    release.take(flight.fix(S), S + 300 * MS, flight.look)
+    stamp = S + round(apart_s * S)
+    release.take(flight.fix(stamp, error=(0.0, 30.0, 0.0), counter=counter), stamp + 300 * MS, flight.look)
+    assert release.counts["contradicted"] == 0
+    release.take(flight.fix(stamp + S, counter=counter), stamp + S + 300 * MS, flight.look)
+    assert release.counts["contradicted"] == 1, "it can find something"
 
 
 def test_capture_stamps_that_step_are_refused():
@@ -261,6 +276,35 @@ def test_what_waited_for_the_line_too_long_is_dropped(mode):
     assert release.next_ns() is None
     release.take(flight.fix(9 * S), 9 * S + 100 * MS, flight.look)
     assert release.due(9 * S + 990 * MS, flight.look) is not None
+
+
+def test_how_old_a_fix_may_be_is_the_owners_to_say():
+    flight = Flight()
+    for mode, is_sent in (("raw", False), ("fast-forward", False), ("fixed-latency", True)):
+        # Held to an age, it may have that age and a little more.
+        release = Release(LinkOptions(endpoint="udp:x:1", release=mode), max_age_ms=100.0)
+        release.take(flight.fix(S), S + 50 * MS, flight.look)
+        assert (release.due(S + 260 * MS, flight.look) is not None) is is_sent
+
+
+def test_the_owner_is_told_when_to_ask():
+    flight = Flight()
+    for mode, ready, then in (
+        ("raw", 0, None), ("fixed-latency", S + 250 * MS, None), ("fast-forward", 25 * MS, S + 360 * MS),
+    ):  # fmt: skip
+        release = make(release=mode)
+        assert release.next_ns() is None
+        release.take(flight.fix(S), S + 100 * MS, flight.look)
+        assert release.next_ns() == ready
+        assert release.due(S + 260 * MS, flight.look) is not None
+        assert release.next_ns() == then
+
+
+def test_a_fix_before_anything_was_heard_is_as_it_is():
+    release = make()
+    fix = Flight().fix(S)
+    release.take(fix, S + 300 * MS, lambda stamp_ns: None)
+    assert release.due(S + 300 * MS, lambda stamp_ns: None).estimate is fix
 
 
 def test_a_fix_held_to_the_longest_age_is_not_too_old():

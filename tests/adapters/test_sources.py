@@ -85,6 +85,14 @@ def test_two_sets_are_needed():
         make(switch_sources=True, vision_source_set=1)
 
 
+@pytest.mark.parametrize("send", [("gps_input",), ("global_position_sensor", "gps_input")])
+def test_no_switch_to_a_set_that_nothing_feeds(send):
+    """To a source set all GPS instances are one source, and ExternalNav hears neither of these messages."""
+    with pytest.raises(ValueError, match="add odometry"):
+        make(switch_sources=True, send=send)
+    assert make(switch_sources=True, send=(*send, "odometry")) and make(send=send)
+
+
 def test_command_is_said_until_answered():
     pending = PendingSwitch()
     assert pending.due(0) is None and pending.settle(accepted=True, answer=0) is None
@@ -122,6 +130,13 @@ def test_nothing_is_commanded_while_an_answer_is_awaited():
     switch = make(switch_sources=True)
     assert switch.decide(BAD, True, Autopilot.ARDUPILOT, 0, S, vision_posxy=6) is not None
     assert switch.decide(BAD, True, Autopilot.ARDUPILOT, 0, 100 * S, vision_posxy=6) is None and not switch.on_vision
+
+
+def test_an_answer_that_belongs_to_no_command_of_ours_changes_nothing():
+    switch = make(switch_sources=True)
+    assert switch.settle(Outcome(2, True, 0), 0) is None and not switch.on_vision
+    commanded = switch.decide(BAD, True, Autopilot.ARDUPILOT, 0, S, vision_posxy=6)
+    assert switch.settle(Outcome(commanded.number + 1, True, 0), S) is None and not switch.on_vision
 
 
 @pytest.mark.parametrize("posxy", [None, 0, 3])
@@ -191,18 +206,34 @@ def test_viso_delay(mode, viso):
     assert f"VISO_DELAY_MS = {viso}" in str(advice)
 
 
+def test_without_an_answer_about_time_the_way_counts_for_nothing():
+    assert advise(Autopilot.ARDUPILOT, "fixed-latency", meter(100.0), 200.0, None).viso_delay_ms == 200
+
+
 def test_viso_delay_has_a_limit_that_is_told():
     advice = advise(Autopilot.ARDUPILOT, "raw", meter(400.0, 420.0), 250.0, 8 * MS)
     assert advice.viso_delay_ms == 250 and "fast-forward" in advice.note
 
 
+def test_the_default_fixed_latency_is_within_the_limit():
+    """Half a round trip beyond 250 ms is no latency that anybody could lower; 30 ms are."""
+    options = LinkOptions(endpoint="udp:x:1")
+    assert not advise(Autopilot.ARDUPILOT, "fixed-latency", meter(*SPREAD), options.fixed_latency_ms, 8 * MS).note
+    note = advise(Autopilot.ARDUPILOT, "fixed-latency", meter(*SPREAD), 280.0, 8 * MS).note
+    assert "284 ms" in note and "lower fixed_latency_ms" in note
+
+
 @pytest.mark.parametrize("mode", ["fast-forward", "fixed-latency", "raw"])
 def test_px4_needs_no_delay_where_it_synchronises(mode):
     advice = advise(Autopilot.PX4, mode, meter(*SPREAD), 250.0, 8 * MS)
-    assert advice.ev_delay_ms == 0
+    assert advice.ev_delay_ms == 0 and "EKF2_EV_DELAY = 0" in str(advice) and "VISO" not in str(advice)
     # But it stamps GLOBAL_POSITION_SENSOR on arrival.
     assert advice.agp_delay_ms == {"fast-forward": 4, "fixed-latency": 254, "raw": 174}[mode]
     assert advice.delay_max_ms == {"fast-forward": 10, "fixed-latency": 260, "raw": 230}[mode]
+
+
+def test_the_filter_must_look_back_to_the_fix_that_came_late():
+    assert advise(Autopilot.PX4, "fixed-latency", meter(*SPREAD, 400.0, 400.0), 250.0, 8 * MS).delay_max_ms >= 400
 
 
 @pytest.mark.parametrize(("mode", "delay"), [("fast-forward", 10), ("fixed-latency", 260), ("raw", 180)])

@@ -7,20 +7,32 @@ import select
 import socket
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
+import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from ortholoc_edge.adapters.computer import ComputerStatus
 from ortholoc_edge.adapters.mavlink import AutopilotLink, LinkOptions, Severity
 from ortholoc_edge.adapters.mavlink import link as link_module
+from ortholoc_edge.adapters.mavlink.geodesy import Place
 from ortholoc_edge.adapters.mavlink.options import parse_endpoint
 from ortholoc_edge.adapters.mavlink.transport import open_transport
 from ortholoc_edge.clock import SystemClock
 
 from .fake_autopilot import FakeAutopilot, PtyWire, TcpWire, UdpWire, Wire
 from .router import GroundStation, Router
-from .test_mavlink import check_attitude, estimate, flying, free_udp_port, good_state, heartbeat, wait_for
+from .test_mavlink import (
+    check_attitude,
+    estimate,
+    flying,
+    free_udp_port,
+    good_state,
+    heartbeat,
+    received,
+    wait_for,
+)
 
 MS = 1_000_000
 
@@ -82,7 +94,7 @@ def test_the_first_vehicle_heard_is_kept_behind_a_router():
         with link:
             wait_for(lambda: good_state(link))
             other = FakeAutopilot(UdpWire(("127.0.0.1", router.ports[1])), system_id=9)
-            wait_for(lambda: link.statistics().get("other_vehicles", 0) > 5)
+            wait_for(lambda: link.statistics().get("other_vehicles", 0) > 2)
             assert link.vehicle.system_id == 7 and good_state(link)
     finally:
         for one in (ours, other, router):
@@ -120,6 +132,28 @@ def test_flight_controller_on_usb_reboots(tmp_path):
     finally:
         link.stop()
         autopilot.close()
+
+
+def test_a_line_is_read_by_one_program_only():
+    """Of two, each would get half of every frame."""
+    wire = PtyWire()
+    endpoint = parse_endpoint(f"serial:{wire.path}:921600")
+    first = open_transport(endpoint)
+    with pytest.raises(OSError, match="lock"):
+        open_transport(endpoint)
+    first.close()
+    wire.close()
+
+
+def test_the_end_of_a_stream_is_an_error():
+    """Readable for ever without a byte: the thread, which runs before all others, would read and read."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        transport = open_transport(parse_endpoint(f"tcp:127.0.0.1:{server.getsockname()[1]}"))
+        server.accept()[0].close()
+        select.select([transport], [], [], 5.0)
+        with pytest.raises(ConnectionError, match="closed by the other side"):
+            transport.receive()
+        transport.close()
 
 
 def test_who_hangs_up_at_once_is_called_more_and_more_seldom():
@@ -194,18 +228,81 @@ def test_a_flood_of_datagrams_leaves_time_to_speak():
     assert sum(data == frame for turn in turns for data, _ in turn) == 100
 
 
-def test_timesync_is_answered_under_a_flood():
+def test_timesync_is_answered_under_a_flood(caplog):
     wire = UdpWire()
     autopilot = FakeAutopilot(wire, autopilot=dialect.MAV_AUTOPILOT_PX4)
     link = AutopilotLink(LinkOptions(endpoint=f"udpout:127.0.0.1:{wire.port}"), SystemClock())
     with flying(link, autopilot):
         wait_for(lambda: autopilot.timesync_answers)
         before = len(autopilot.timesync_answers)
-        for _ in range(40):
+        for _ in range(20):
             wire.write(b"\xfe" * 60_000)
             time.sleep(0.05)
         wait_for(lambda: len(autopilot.timesync_answers) > before + 5, 20.0)
         assert link.connected() and link.statistics()["reconnects"] == 0
+        assert link.statistics()["cut_datagrams"] >= 10
+    assert caplog.text.count("more than 4096 bytes is cut") == 1
+
+
+class _Sent:
+    """A transport that keeps what is sent."""
+
+    def __init__(self):
+        self.frames = []
+
+    def send(self, frame):
+        self.frames.append(frame)
+        return True
+
+    def prefer(self, peer):
+        pass
+
+    def pending(self):
+        return False
+
+
+@pytest.mark.parametrize(("send", "is_local"), [("gps_input", False), ("odometry", True)])
+def test_what_external_nav_hears_is_told_from_what_left_the_link(send, is_local):
+    link, line = AutopilotLink(LinkOptions(endpoint="udp:x:1", send=(send,), release="raw"), SystemClock()), _Sent()
+    link._take_message(line, received(heartbeat()), None, time.monotonic_ns())
+    link.send_estimate(replace(estimate(time.monotonic_ns()), place=Place(50.0, 7.0, 100.0)))
+    assert not link.sent_since(0)
+    link._say(line)
+    assert link.sent_since(0) and link.sent_since(0, local=True) is is_local
+
+
+def test_many_senders_do_not_fill_the_memory():
+    link, line = AutopilotLink(LinkOptions(endpoint="udp:x:1"), SystemClock()), _Sent()
+    beat = bytes(heartbeat().pack(dialect.MAVLink(None, 7, 1)))
+    for port in range(50):
+        link._take(line, beat + b"\xfe", ("127.0.0.1", port), port)
+    assert len(link._parsers) == 8 and link.statistics()["messages"] == 50
+
+
+def test_a_defect_that_stays_ends_the_link_and_says_so(monkeypatch):
+    """A daemon without a link serves nobody; systemd starts both afresh."""
+    wire = UdpWire()
+    autopilot = FakeAutopilot(wire)
+    link = AutopilotLink(LinkOptions(endpoint=f"udpout:127.0.0.1:{wire.port}"), SystemClock())
+    monkeypatch.setattr(link._protocol, "poll", lambda now_ns: 1 // 0)
+    try:
+        with link:
+            wait_for(lambda: not link.is_alive())
+            assert isinstance(link.failure, ZeroDivisionError) and link.statistics()["internal_errors"] == 10
+    finally:
+        autopilot.close()
+
+
+def test_timesync_is_answered_while_another_thread_is_asking():
+    """It may be of low priority, and not get on for as long as others compute."""
+    link, line = AutopilotLink(LinkOptions(endpoint="udp:127.0.0.1:1"), SystemClock()), _Sent()
+    link._take_message(line, received(heartbeat()), None, 0)
+    question = received(dialect.MAVLink_timesync_message(0, 777))
+    taking = threading.Thread(target=link._take_message, args=(line, question, None, 5 * MS))
+    with link._lock:
+        taking.start()
+        wait_for(lambda: line.frames)
+    taking.join()
 
 
 def test_full_write_buffer_on_tcp_drops_and_goes_on():
@@ -217,6 +314,7 @@ def test_full_write_buffer_on_tcp_drops_and_goes_on():
         link = AutopilotLink(LinkOptions(endpoint=f"tcp:127.0.0.1:{server.getsockname()[1]}"), SystemClock())
         with link:
             connection, _ = server.accept()
+            wait_for(lambda: link._transport)._device.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
             mav = dialect.MAVLink(None, 7, 1)
             beat = bytes(dialect.MAVLink_heartbeat_message(2, 3, 128, 0, 4, 3).pack(mav))
             question = bytes(dialect.MAVLink_timesync_message(0, 5).pack(mav)) * 2000
@@ -282,7 +380,21 @@ def test_line_with_loss_and_flipped_bits():
     autopilot = FakeAutopilot(BadLine(wire, loss=0.0005, flip=0.001))
     link = AutopilotLink(LinkOptions(endpoint=f"serial:{wire.path}:921600"), SystemClock())
     with flying(link, autopilot):
-        wait_for(lambda: link.statistics()["bad_frames"] >= 20)
+        wait_for(lambda: link.statistics()["bad_frames"] >= 10)
         # What passes its checksum is right; what does not is gone, and the rest is found.
         check_attitude(wait_for(lambda: good_state(link, back_ms=400)), autopilot)
         assert link.statistics()["reconnects"] == 0 and link.statistics().get("restarts", 0) == 0
+
+
+def test_without_the_right_to_real_time_priority_it_serves_all_the_same(monkeypatch, caplog):
+    def refuse(*_):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(link_module.os, "sched_setscheduler", refuse)
+    caplog.set_level("INFO")
+    wire = UdpWire()
+    autopilot = FakeAutopilot(wire)
+    link = AutopilotLink(LinkOptions(endpoint=f"udpout:127.0.0.1:{wire.port}"), SystemClock())
+    with flying(link, autopilot):
+        wait_for(link.connected)
+    assert caplog.text.count("no real-time priority (Operation not permitted)") == 1

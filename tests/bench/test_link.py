@@ -8,6 +8,7 @@ import random
 
 import pytest
 
+from ortholoc_edge.adapters.mavlink import link as link_module
 from ortholoc_edge.adapters.mavlink.codec import FrameParser
 from ortholoc_edge.adapters.mavlink.options import LinkOptions
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol
@@ -31,15 +32,17 @@ def test_both_times_are_measured(kind):
 
 
 def test_fixes_that_are_carried_on_are_measured_by_their_first_estimate():
-    found = link.measure("udp", 4.0, None, 0, "fast-forward")
-    assert found.release == "fast-forward" and found.estimate.count >= 8
+    found = link.measure("udp", 2.0, None, 0, "fast-forward")
+    assert found.release == "fast-forward" and found.estimate.count >= 4
     assert 0.0 < found.estimate.median_ms < 1000.0
 
 
 @pytest.mark.parametrize("kind", ["tcp", "pty"])
-def test_connecting_and_disconnecting_holds_nothing_back(kind):
+def test_connecting_and_disconnecting_holds_nothing_back(kind, monkeypatch):
+    monkeypatch.setattr(link, "_WARM_ROUNDS", 2)
+    monkeypatch.setattr(link_module, "_BACKOFF_MIN_S", 0.1)
     found = link.soak(kind, 0.0)
-    assert found.rounds == 10
+    assert found.rounds == 4
     assert found.late.threads == found.early.threads and found.late.descriptors == found.early.descriptors
     assert found.late.rss_mib - found.early.rss_mib < 4.0
     assert found.holds_nothing_more
@@ -70,8 +73,17 @@ def test_hostile_bytes_in_any_pieces():
     assert got > 300
 
 
-def test_command_prints_a_table_or_json(capsys):
-    assert main(["bench-link", "--loads", "idle", "--seconds", "0.5"]) == 0
+def test_command_prints_a_table_or_json(capsys, monkeypatch):
+    some = link.Spread(count=9, median_ms=0.5, p99_ms=1.5, max_ms=2.0)
+
+    def measure(kind, seconds, load, seed, release):
+        assert (seconds, load, seed) == (0.3, None, 0)
+        return link.Latencies(
+            wire=kind, load="idle", release=release, estimate=some, timesync=some, is_realtime=True, load_fps=0.0
+        )
+
+    monkeypatch.setattr(link, "measure", measure)
+    assert main(["bench-link", "--loads", "idle", "--seconds", "0.3"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[2].startswith("| wire |")
     # Each wire by both ways of release.

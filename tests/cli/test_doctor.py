@@ -17,7 +17,7 @@ from adapters.fake_autopilot import FakeAutopilot, PtyWire, UdpWire
 from adapters.firmware_parameters import ARDUPILOT_READY, ARDUPILOT_STOCK, PX4_STOCK
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from ortholoc_edge.adapters.mavlink import audit
+from ortholoc_edge.adapters.mavlink import audit, parameters, protocol
 from ortholoc_edge.cli import doctor, main
 
 CONFIG = Path(__file__).resolve().parents[2] / "config" / "example.toml"
@@ -25,7 +25,11 @@ CONFIG = Path(__file__).resolve().parents[2] / "config" / "example.toml"
 
 @pytest.fixture(autouse=True)
 def listening_is_short_and_lenient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "_LISTEN_NS", 1_500_000_000)
+    monkeypatch.setattr(doctor, "_LISTEN_NS", 1_000_000_000)
+    # Half the patience: what is absent, read-only or silent is so after seconds, too.
+    for name in ("_REQUEST_INTERVAL_NS", "_PATIENCE_NS", "_WRITE_PATIENCE_NS"):
+        value = getattr(parameters, name)
+        monkeypatch.setattr(parameters, name, value // 4 if isinstance(value, int) else tuple(v // 2 for v in value))
     # A busy test machine is not what is tested here: rates and round trips are judged in test_audit.
     monkeypatch.setattr(audit, "_LEAST_RATE_RATIO", 0.0)
     monkeypatch.setattr(audit, "_PX4_MOST_ROUND_TRIP_MS", 1000.0)
@@ -108,7 +112,9 @@ def test_a_latency_counts_as_the_release_makes_of_it(
         main(command if release is None else [*command, "--config", configured(tmp_path, release=release)])
         # Half a round trip comes to it.
         assert viso_delay_ms <= fake.parameters["VISO_DELAY_MS"] <= min(viso_delay_ms + 15, 250)
-    capsys.readouterr()
+    text = capsys.readouterr().out
+    assert f'old on arrival, with release = "{release or "fast-forward"}"' in text
+    assert ("assumed for want of --config" in text) == (release is None)
 
 
 def test_px4_is_mended_in_its_own_encoding(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -184,8 +190,9 @@ def test_a_vehicle_that_fell_silent_is_left_alone(
     with autopilot(ARDUPILOT_STOCK) as (fake, endpoint):
 
         def fall_silent() -> None:
+            monkeypatch.setattr(protocol, "_SILENT_AFTER_NS", 1_000_000_000)
             fake.mute = True
-            time.sleep(3.5)
+            time.sleep(1.2)
 
         monkeypatch.setattr("sys.stdin", Answers(1, fall_silent))
         assert main(["doctor", "--link", endpoint, "--fix"]) == 1

@@ -71,8 +71,9 @@ NOTES = """
   too little. So are those for builds that are not releases (dev, alpha, beta, rc: AUTOPILOT_VERSION tells), at any
   version, since such a build may have what the release of its number has, or not. A PX4 build of that kind gets
   ODOMETRY.
-- **MAV_CMD_EXTERNAL_POSITION_ESTIMATE** (`[link] recovery = true`) goes ahead of the first estimate after an outage, as
-  ArduPilot takes it only while it has fused no position for a second, and PX4 only while it dead reckons.
+- **MAV_CMD_EXTERNAL_POSITION_ESTIMATE** (`[link] recovery = true`) goes ahead of the first estimate after an outage:
+  more than a second, and than two and a half of the usual pauses, without one. ArduPilot takes it only while it has
+  fused no position for a second, and PX4 only while it dead reckons.
 - **GPS_INPUT** needs the date. While the system clock is not between 2026 and 2076 it is refused. A step of that clock
   is a step of its stamps; ArduPilot then takes up to 100 messages to find the delay again. It is for one GPS instance,
   `[link] gps_id` (1 unless set: the second, GPS2_TYPE 14); ArduPilot drops what is for another without a word.

@@ -69,7 +69,7 @@ def test_between_autopilot_and_us(peers_python, tmp_path, autopilot, version, na
         [vehicle] = sdk.wait_for(lambda: records(sdk, "vehicle"), "discovery by MAVSDK")
         assert (vehicle["system"], vehicle["autopilot"], tuple(vehicle["firmware"])) == (VEHICLE, name, version)
         sdk.wait_for(lambda: is_served(link, fake), "service through MAVSDK")
-        check_attitude(good_state(link), fake)
+        check_attitude(wait_for(lambda: good_state(link)), fake)
         say_text(link)
         sdk.wait_for(
             lambda: len(records(sdk, "odometry")) >= 5 and records(sdk, "text")

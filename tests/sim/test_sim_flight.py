@@ -56,12 +56,11 @@ def flown(
     for tick in range(round(seconds * 50)):
         now = START + tick * S // 50
         out = loop.advance(now)
-        replies = [
-            answer
-            for sent in out
-            for message in from_autopilot.feed(sent.pack(theirs), now)
-            for answer in protocol.on_message(message, now)
-        ]
+        replies = []
+        for sent in out:
+            for message in from_autopilot.feed(sent.pack(theirs), now):
+                protocol.on_message(message, now)
+                replies += filter(None, [protocol.answer(message, now)])
         replies += protocol.poll(now)
         taken = now - round(latency_s * S)
         truth = loop.truth_at(taken)
@@ -72,7 +71,7 @@ def flown(
         outgoing = protocol.release.due(now, protocol.state_at)
         if outgoing is not None:
             replies += protocol.encode_estimate(outgoing.estimate, now)
-            protocol.sent(outgoing, now)
+            protocol.sent(outgoing, now, local=True)
         for reply in replies:
             for answer in loop.receive(from_us.feed(reply.pack(ours), now), now):
                 for message in from_autopilot.feed(answer.pack(theirs), now):
@@ -116,7 +115,7 @@ def test_as_ardupilot_stamps_only_fast_forward_holds_it(site: Site) -> None:
     assert carried_m < 0.9
     assert raw_m > 2.0 * carried_m
     assert protocol.release.displacement_trusted
-    assert protocol.fusion.state is Fusion.FUSED
+    assert protocol.monitor.report.state is Fusion.FUSED
     advice = protocol.delay_advice()
     assert advice is not None and advice.viso_delay_ms == 0
 
@@ -124,9 +123,9 @@ def test_as_ardupilot_stamps_only_fast_forward_holds_it(site: Site) -> None:
 def test_the_monitor_tells_standby_from_fused(site: Site) -> None:
     """While GNSS is in use nothing shows whose the position is; after it, the position is at the fixes."""
     _, protocol = flown(site, 9.5, estimates=True, release="fast-forward")
-    assert protocol.fusion.state is Fusion.UNKNOWN
+    assert protocol.monitor.report.state is Fusion.UNKNOWN
     _, protocol = flown(site, 25.0, estimates=True, release="fast-forward")
-    assert protocol.fusion.state is Fusion.FUSED
+    assert protocol.monitor.report.state is Fusion.FUSED
 
 
 def test_without_estimates_it_drifts_off(site: Site) -> None:
@@ -148,12 +147,11 @@ def test_a_gimbal_on_a_moving_vehicle_is_known_at_the_exposure(site: Site) -> No
     off_deg, bank_deg = [], []
     for tick in range(30 * 50):
         now = START + tick * S // 50
-        replies = [
-            answer
-            for sent in loop.advance(now)
-            for message in from_autopilot.feed(sent.pack(theirs), now)
-            for answer in protocol.on_message(message, now)
-        ]
+        replies = []
+        for sent in loop.advance(now):
+            for message in from_autopilot.feed(sent.pack(theirs), now):
+                protocol.on_message(message, now)
+                replies += filter(None, [protocol.answer(message, now)])
         for reply in replies + protocol.poll(now):
             for answer in loop.receive(from_us.feed(reply.pack(ours), now), now):
                 for message in from_autopilot.feed(answer.pack(theirs), now):

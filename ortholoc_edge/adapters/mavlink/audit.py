@@ -12,16 +12,17 @@ from enum import StrEnum
 
 from ortholoc_edge.adapters.mavlink.census import LinkHealth, Peer
 from ortholoc_edge.adapters.mavlink.estimates import Autopilot
-from ortholoc_edge.adapters.mavlink.latency import Ages
+from ortholoc_edge.adapters.mavlink.latency import (
+    DELAY_SLACK_MS,
+    MOST_AGP_DELAY_MS,
+    MOST_EV_DELAY_MS,
+    MOST_VISO_DELAY_MS,
+    Ages,
+)
 from ortholoc_edge.adapters.mavlink.parameters import Answer, Number, Reading
 
 Version = tuple[int, int, int]
 
-# ArduPilot sizes its buffer for no more; the ends of EKF2_EV_DELAY's and EKF2_AGPn_DELAY's ranges.
-_MOST_VISO_DELAY_MS, _MOST_EV_DELAY_MS, _MOST_AGP_DELAY_MS = 250.0, 300.0, 1000.0
-# A delay this wrong is 0.4 m at 20 m/s. With 190 ms too little a real ArduPilot in software flew a square to 0.75 m
-# instead of 0.07 m.
-_DELAY_SLACK_MS = 20.0
 # PX4 discards TIMESYNC answers that took longer.
 _PX4_MOST_ROUND_TRIP_MS = 10.0
 _LEAST_BAUD = 460_800
@@ -167,14 +168,14 @@ def _delay(situation: Situation, name: str, most_ms: float, latency_ms: float | 
             "a constant delay is known to the filter by this parameter alone, and no measured latency was given",
             "measure it (the daemon reports it) and give it with --latency-ms",
         )  # fmt: skip
-    elif latency_ms > most_ms + _DELAY_SLACK_MS:
+    elif latency_ms > most_ms + DELAY_SLACK_MS:
         yield Finding(
             Level.ERROR, name, f"{found:g}", f"{latency_ms:.0f}",
             f"fixes are {latency_ms:.0f} ms old when they are sent, and this parameter ends at {most_ms:g}: what is "
             "older is taken for newer than it is",
             "make the pipeline faster, or have fixes carried forward before they are sent",
         )  # fmt: skip
-    elif abs(found - min(latency_ms, most_ms)) > _DELAY_SLACK_MS:
+    elif abs(found - min(latency_ms, most_ms)) > DELAY_SLACK_MS:
         yield from _setting(
             situation, Level.WARNING, name, round(min(latency_ms, most_ms)),
             "a constant delay is known to the filter by this parameter alone: each 10 ms wrong are 0.2 m at 20 m/s",
@@ -430,7 +431,7 @@ def _viso_type(situation: Situation) -> Iterator[Finding]:
 def _viso_delay(situation: Situation) -> Iterator[Finding]:
     # It takes the least of the last hundred for the transport's.
     low_ms = None if situation.ages is None else situation.ages.low_ms
-    yield from _delay(situation, "VISO_DELAY_MS", _MOST_VISO_DELAY_MS, low_ms)
+    yield from _delay(situation, "VISO_DELAY_MS", MOST_VISO_DELAY_MS, low_ms)
 
 
 def _viso_lever_arm(situation: Situation) -> Iterator[Finding]:
@@ -608,8 +609,8 @@ def _ev_delay(situation: Situation) -> Iterator[Finding]:
     """PX4 takes our stamps of exposure as soon as its TIMESYNC has converged; if it can't, the time of arrival."""
     found = situation.value("EKF2_EV_DELAY")
     if _slow_for_px4(situation.health):
-        yield from _delay(situation, "EKF2_EV_DELAY", _MOST_EV_DELAY_MS, _usual_ms(situation))
-    elif found is not None and found > _DELAY_SLACK_MS:
+        yield from _delay(situation, "EKF2_EV_DELAY", MOST_EV_DELAY_MS, _usual_ms(situation))
+    elif found is not None and found > DELAY_SLACK_MS:
         yield from _setting(
             situation, Level.WARNING, "EKF2_EV_DELAY", 0,
             "our stamps are those of the exposure, so a latency that is set here too is taken off twice", reboot=True,
@@ -727,7 +728,7 @@ def _agp(situation: Situation) -> Iterator[Finding]:
             yield from _setting(
                 situation, Level.WARNING, f"EKF2_AGP{n}_NOISE", 1.0, "a better fix counts as no better than this"
             )
-        yield from _delay(situation, f"EKF2_AGP{n}_DELAY", _MOST_AGP_DELAY_MS, _usual_ms(situation))
+        yield from _delay(situation, f"EKF2_AGP{n}_DELAY", MOST_AGP_DELAY_MS, _usual_ms(situation))
         if situation.value(f"EKF2_AGP{n}_MODE") == 1:
             yield Finding(
                 Level.NOTE, f"EKF2_AGP{n}_MODE", "1", "0 or 1, knowingly",

@@ -150,8 +150,7 @@ def plan_line(options: LinkOptions, endpoint: Endpoint, *, has_gimbal: bool = Fa
 
     # Each side asks and answers: requests of both go both ways.
     timesync = share("TIMESYNC", _TIMESYNC_OWN_HZ + _TIMESYNC_ASKED_HZ[autopilot])
-    is_repeated = options.release == "fast-forward" and options.estimate_rate_hz > 0
-    estimates_hz = options.estimate_rate_hz if is_repeated else _MOST_FIXES_HZ
+    estimates_hz = options.estimate_rate_hz if options.way_of_release == "fast-forward" else _MOST_FIXES_HZ
     estimates = [
         share(name.upper(), estimates_hz, "lower estimate_rate_hz or name fewer messages in send")
         # What "auto" will choose is not known yet; ODOMETRY is the longest of them.

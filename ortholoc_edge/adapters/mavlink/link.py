@@ -32,7 +32,7 @@ from ortholoc_edge.adapters.mavlink.signing import ACCEPTED, STORE_INTERVAL_S, V
 from ortholoc_edge.adapters.mavlink.sinks import Sink
 from ortholoc_edge.adapters.mavlink.sources import Outcome
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity, AutopilotState
-from ortholoc_edge.adapters.mavlink.transport import Transport, open_transport
+from ortholoc_edge.adapters.mavlink.transport import IN_LIMIT_BYTES, Transport, open_transport
 from ortholoc_edge.clock import Clock, wall_clock_ns
 from ortholoc_edge.errors import LinkError
 
@@ -45,7 +45,9 @@ _TCP_SILENCE_NS = 10 * _S
 _BACKOFF_MIN_S, _BACKOFF_MAX_S = 0.5, 10.0
 _SELECT_TIMEOUT_S = 0.05
 _GIVE_UP_AFTER_ERRORS = 10
+# Not the command of a recovery, which may go before an estimate.
 _CARRY_ESTIMATES = {sink.value.upper() for sink in Sink if sink is not Sink.EXTERNAL_POSITION_ESTIMATE}
+_CARRY_LOCAL = {sink.value.upper() for sink in Sink if sink.local}
 # For `sys.setswitchinterval`, by who owns the process: how long the link's thread waits at most for a thread that
 # computes in Python. By default 5 ms, each time that it comes back from the kernel.
 SWITCH_INTERVAL_S = 1e-4
@@ -221,17 +223,20 @@ class AutopilotLink:
             )
         self._wake()
 
-    def estimate_sent_since(self, since_ns: int) -> bool:
-        """Whether an estimate left the link after ``since_ns``: the line took it, whatever became of it there."""
+    def sent_since(self, since_ns: int, *, local: bool = False) -> bool:
+        """Whether an estimate left the link after ``since_ns``: the line took it, whatever became of it there.
+
+        Args:
+            local: count only messages that count from the EKF origin, the ones that ArduPilot's ExternalNav takes.
+        """
         with self._lock:
-            sent_ns = self._protocol.last_sent_ns
-        return sent_ns is not None and sent_ns > since_ns
+            return self._protocol.sent_since(since_ns, local=local)
 
     @property
     def fusion(self) -> FusionReport:
         """What the autopilot's filter does with our fixes."""
         with self._lock:
-            return self._protocol.fusion
+            return self._protocol.monitor.report
 
     @property
     def delay_advice(self) -> DelayAdvice | None:
@@ -460,7 +465,7 @@ class AutopilotLink:
             if writable:
                 transport.flush()
             now_ns = self._clock.now_ns()
-            arrived = transport.receive() if transport in readable else []
+            arrived = self._receive(transport, now_ns) if transport in readable else []
             if arrived:
                 last_heard_ns = now_ns
             elif (
@@ -482,6 +487,17 @@ class AutopilotLink:
             errors_in_a_row = errors_in_a_row + 1 if errors else 0
             if errors_in_a_row >= _GIVE_UP_AFTER_ERRORS:
                 raise errors[-1]
+
+    def _receive(self, transport: Transport, now_ns: int) -> list[tuple[bytes, Any]]:
+        before = transport.cut_datagrams
+        arrived = transport.receive()
+        if transport.cut_datagrams > before:
+            self._counts["cut_datagrams"] += transport.cut_datagrams - before
+            self._log(
+                now_ns, logging.WARNING, "cut",
+                f"a datagram of more than {IN_LIMIT_BYTES} bytes is cut to that; have its sender make smaller ones",
+            )  # fmt: skip
+        return arrived
 
     def _left_out(self, error: Exception) -> Exception:
         self._counts["internal_errors"] += 1
@@ -521,8 +537,11 @@ class AutopilotLink:
     def _take_message(self, transport: Transport, message: MavlinkMessage, peer: Any, now_ns: int) -> None:
         self._counts["messages"] += 1
         self._counts[f"received_bytes.{message.get_type()}"] += len(message.get_msgbuf())
+        answer = self._protocol.answer(message, now_ns)
+        if answer is not None:
+            self._send(transport, answer)
         with self._lock:
-            answers = self._protocol.on_message(message, now_ns)
+            self._protocol.on_message(message, now_ns)
             vehicle = self._protocol.vehicle
         # Replies go where our autopilot is. Until it was heard, to whoever speaks MAVLink.
         ours = vehicle is not None and message.get_srcSystem() == vehicle.system_id
@@ -531,8 +550,6 @@ class AutopilotLink:
             self._peer_is_vehicle = True
         elif not self._peer_is_vehicle:
             transport.prefer(peer)
-        for answer in answers:
-            self._send(transport, answer)
 
     def _accepts(self, transport: Transport, message: MavlinkMessage, peer: Any) -> bool:
         """Whether a frame's signature lets it count."""
@@ -576,12 +593,10 @@ class AutopilotLink:
                 encoded = []
             while self._texts:
                 messages.append(self._texts.popleft())
-        went_out = [self._send(transport, message) for message in encoded]
-        # Not the command of a recovery, which may have gone before it.
-        is_out = any(ok and m.get_type() in _CARRY_ESTIMATES for m, ok in zip(encoded, went_out, strict=True))
-        if outgoing is not None and is_out:
+        went_out = {message.get_type() for message in encoded if self._send(transport, message)}
+        if outgoing is not None and went_out & _CARRY_ESTIMATES:
             with self._lock:
-                self._protocol.sent(outgoing, now_ns)
+                self._protocol.sent(outgoing, now_ns, local=bool(went_out & _CARRY_LOCAL))
         for message in messages:
             self._send(transport, message)
 

@@ -58,7 +58,8 @@ class LinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
             max_repeat_s: how long it goes on without a new fix.
         fixed_latency_ms: the age of "fixed-latency".
         switch_sources: whether we may tell ArduPilot to take another source set (MAV_CMD_SET_EKF_SOURCE_SET) when
-            GNSS contradicts vision, and back. vision_source_set, gnss_source_set: n of EK3_SRCn_*.
+            GNSS contradicts vision, and back. vision_source_set, gnss_source_set: n of EK3_SRCn_*. Only where ``send``
+            has a message for ExternalNav: to a source set all GPS instances are one source.
         computer_status_rate_hz: of ONBOARD_COMPUTER_STATUS; 0 sends none.
         quality_rate_hz: of the three NAMED_VALUE_FLOAT about the last estimate; 0 sends none.
         signing_key: path of MAVLink 2's signing key, or the name of a systemd credential; None signs nothing and
@@ -96,10 +97,20 @@ class LinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     signing_state: Annotated[str, msgspec.Meta(min_length=1)] | None = None
     require_signed: bool = False
 
+    @property
+    def way_of_release(self) -> Literal["fast-forward", "fixed-latency", "raw"]:
+        """What ``release`` and ``estimate_rate_hz`` come to."""
+        return "raw" if self.release == "fast-forward" and self.estimate_rate_hz == 0.0 else self.release
+
     def __post_init__(self) -> None:
         if self.switch_sources and self.vision_source_set == self.gnss_source_set:
             raise ValueError(
                 f"vision_source_set and gnss_source_set are both {self.vision_source_set}; switch_sources needs two"
+            )
+        if self.switch_sources and set(self.send).isdisjoint(("auto", "odometry", "vision_position_estimate")):
+            raise ValueError(
+                f"switch_sources commands a source set of ExternalNav, which send = {list(self.send)} does not feed; "
+                "add odometry to send, or set switch_sources to false"
             )
         if "auto" in self.send and len(self.send) > 1:
             raise ValueError(f"send = {list(self.send)} mixes auto with names; write either [\"auto\"] or the names")

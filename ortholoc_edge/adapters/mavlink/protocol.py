@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections import Counter, OrderedDict
+from collections import Counter, OrderedDict, deque
 from collections.abc import Callable
+from statistics import median
 
 from ortholoc_edge.adapters.computer import ComputerStatus
 from ortholoc_edge.adapters.mavlink.census import Census, LinkHealth
@@ -14,7 +15,7 @@ from ortholoc_edge.adapters.mavlink.geodesy import GeodeticOrigin
 from ortholoc_edge.adapters.mavlink.gimbal import GimbalSelection
 from ortholoc_edge.adapters.mavlink.latency import Ages, DelayAdvice, LatencyMeter, advise, ages_of
 from ortholoc_edge.adapters.mavlink.log import LimitedLog
-from ortholoc_edge.adapters.mavlink.monitor import FusionMonitor, FusionReport
+from ortholoc_edge.adapters.mavlink.monitor import FusionMonitor
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus, parse_endpoint
 from ortholoc_edge.adapters.mavlink.outlet import Outlet
 from ortholoc_edge.adapters.mavlink.parameters import ParameterClient
@@ -52,8 +53,9 @@ _ORIGIN_QUESTIONS = 3
 # The same text is logged once in this time; of this many texts it is known when that was.
 _TEXT_AGAIN_NS = 10 * _S
 _MOST_TEXTS = 256
-# ArduPilot sets its position by command only while its filter has fused none for a second.
-_OUTAGE_NS = 1 * _S
+# ArduPilot sets its position by command only while its filter has fused none for a second. Where estimates usually are
+# rarer, that is no outage but their rhythm: to set the position anew each time would undo all that the filter weighed.
+_OUTAGE_NS, _OUTAGE_RATIO = 1 * _S, 2.5
 
 
 def _repeat_at(rate_hz: float) -> Repeat | None:
@@ -63,8 +65,8 @@ def _repeat_at(rate_hz: float) -> Repeat | None:
 class LinkProtocol:
     """What is said and asked, and to whom; what was heard of the vehicle is kept by its ``telemetry``.
 
-    Its owner calls :meth:`on_message` for each message that arrives and :meth:`poll` at least every 50 ms,
-    and sends what both return, in order.
+    Its owner calls :meth:`answer` and :meth:`on_message` for each message that arrives and :meth:`poll` at least every
+    50 ms, and sends what they return, in order. :meth:`answer` alone may be called while another thread is in here.
     """
 
     def __init__(
@@ -76,7 +78,9 @@ class LinkProtocol:
         self.system_status = SystemStatus.BOOT
         self.computer: ComputerStatus | None = None
         self._last_sent: Outgoing | None = None
-        self.last_sent_ns: int | None = None
+        self._sent_ns: int | None = None
+        self._local_sent_ns: int | None = None
+        self._pauses_ns: deque[int] = deque(maxlen=5)
         self.timesync = TimeSync()
         self.counts: Counter[str] = Counter()
         self.telemetry = Telemetry(
@@ -162,28 +166,41 @@ class LinkProtocol:
 
     # -- in --------------------
 
-    def on_message(self, message: MavlinkMessage, arrival_ns: int) -> list[MavlinkMessage]:
-        """Take in one message; returns what must be answered at once."""
+    def answer(self, message: MavlinkMessage, arrival_ns: int) -> MavlinkMessage | None:
+        """What must be said to a message at once: our time, if our autopilot asks for it.
+
+        It changes nothing and looks at one value only, so that it need not wait until a thread of low priority that
+        asks for a state, say, is done.
+        """
+        vehicle = self._vehicle
+        if vehicle is None or message.get_type() != "TIMESYNC" or message.tc1 != 0:
+            return None
+        if (message.get_srcSystem(), message.get_srcComponent()) != (vehicle.system_id, _AUTOPILOT_COMPONENT):
+            return None
+        return dialect.MAVLink_timesync_message(tc1=arrival_ns, ts1=message.ts1)
+
+    def on_message(self, message: MavlinkMessage, arrival_ns: int) -> None:
+        """Take in one message."""
         system, component = message.get_srcSystem(), message.get_srcComponent()
         name = message.get_type()
         self._census.take(message)
         if system == self.own_system_id and component == self._options.component_id:
             self.counts["own_echo"] += 1
-            return []
+            return
         if name == "HEARTBEAT" and component == _AUTOPILOT_COMPONENT:
             self._on_heartbeat(message, system, arrival_ns)
-            return []
+            return
         if self._vehicle is None or (system, component) != (self._vehicle.system_id, _AUTOPILOT_COMPONENT):
             ours = self._vehicle is not None and system == self._vehicle.system_id
             taken = ours and self.telemetry.take_of_component(message, arrival_ns)
             self.counts[f"received.{name}" if taken else "ignored"] += 1
-            return []
+            return
         self.counts[f"received.{name}"] += 1
         self._census.take_vehicles(name, arrival_ns)
         if name in self._streams:
             self._streams[name].heard(arrival_ns)
         if name == "TIMESYNC" and message.tc1 == 0:
-            return [dialect.MAVLink_timesync_message(tc1=arrival_ns, ts1=message.ts1)]
+            return
         restart = self.telemetry.take(message, arrival_ns)
         if restart is not None:
             self._start_over(restart, arrival_ns)
@@ -192,7 +209,6 @@ class LinkProtocol:
         handler = self._handlers.get(name)
         if handler is not None:
             handler(message, arrival_ns)
-        return []
 
     def is_vehicle_heartbeat(self, message: MavlinkMessage) -> bool:
         """Whether this is the heartbeat of an autopilot that we may serve, not of a ground station or a
@@ -441,20 +457,26 @@ class LinkProtocol:
 
     def is_outage(self, now_ns: int) -> bool:
         """Whether estimates flowed and none left for so long that ArduPilot takes a new position by command."""
-        return self.last_sent_ns is not None and now_ns - self.last_sent_ns > _OUTAGE_NS
+        usual_ns = median(self._pauses_ns or (0,))
+        return self._sent_ns is not None and now_ns - self._sent_ns > max(_OUTAGE_NS, _OUTAGE_RATIO * usual_ns)
 
-    def sent(self, outgoing: Outgoing, now_ns: int) -> None:
-        """An estimate was handed to the line."""
-        self._last_sent, self.last_sent_ns = outgoing, now_ns
+    def sent(self, outgoing: Outgoing, now_ns: int, *, local: bool) -> None:
+        """An estimate was handed to the line. ``local``: by a message that counts from the EKF origin, too."""
+        if self._sent_ns is not None:
+            self._pauses_ns.append(now_ns - self._sent_ns)
+        self._last_sent, self._sent_ns = outgoing, now_ns
+        if local:
+            self._local_sent_ns = now_ns
         if outgoing.repeat == 0:
             self.counts["fixes_sent"] += 1
             self.latency.add(now_ns - outgoing.capture_ns)
         if self._vehicle is not None:
             self.monitor.sent(outgoing.estimate, now_ns, self.state_at, self._vehicle.autopilot)
 
-    @property
-    def fusion(self) -> FusionReport:
-        return self.monitor.report
+    def sent_since(self, since_ns: int, *, local: bool = False) -> bool:
+        """See :meth:`AutopilotLink.sent_since`."""
+        sent_ns = self._local_sent_ns if local else self._sent_ns
+        return sent_ns is not None and sent_ns > since_ns
 
     def delay_advice(self) -> DelayAdvice | None:
         """What the autopilot should be told of our latency; None before a fix was sent."""
@@ -575,7 +597,7 @@ class LinkProtocol:
         best = self.timesync.best(now_ns)
         round_trip = self.timesync.last_round_trip_ns
         vehicle = self._vehicle
-        advice = self.delay_advice()
+        advice, fusion = self.delay_advice(), self.monitor.report
         return {
             **self.counts,
             **{f"release.{name}": count for name, count in self.release.counts.items()},
@@ -583,9 +605,9 @@ class LinkProtocol:
             "latency_median_ms": self.latency.percentile_ms(50.0),
             "latency_p99_ms": self.latency.percentile_ms(99.0),
             "delay_advice": None if advice is None else str(advice),
-            "fusion": self.fusion.state.value,
-            "fusion_since_s": (now_ns - self.fusion.since_ns) / _S if self.fusion.since_ns else None,
-            "fusion_reason": self.fusion.reason,
+            "fusion": fusion.state.value,
+            "fusion_since_s": (now_ns - fusion.since_ns) / _S if fusion.since_ns else None,
+            "fusion_reason": fusion.reason,
             "connected": self.connected(now_ns),
             "autopilot": vehicle.autopilot.value if vehicle else None,
             "vehicle_system_id": vehicle.system_id if vehicle else None,

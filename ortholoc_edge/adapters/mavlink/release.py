@@ -124,9 +124,7 @@ class Release:
                 than that and a little.
         """
         self.believed = (math.inf, math.inf)
-        self.mode = (
-            "raw" if options.release == "fast-forward" and options.estimate_rate_hz == 0.0 else options.release
-        )
+        self.mode = options.way_of_release
         self.counts: Counter[str] = Counter()
         self._period_ns = round(_S / options.estimate_rate_hz) if options.estimate_rate_hz > 0.0 else 0
         self._max_repeat_ns = round(options.max_repeat_s * _S)

@@ -17,13 +17,19 @@ _OUT_LIMIT_BYTES = 2048
 
 # What is taken in before something is said again: some 35 ms of work if all of it is hostile. A line of 3 Mbaud brings
 # as much in 14 ms.
-_IN_LIMIT_BYTES = 4096
+IN_LIMIT_BYTES = 4096
 _IN_LIMIT_DATAGRAMS = 64
 
 
 class Transport(Protocol):
     """Non-blocking bytes. Every method may raise OSError, after which the transport is closed and opened
-    anew."""
+    anew.
+
+    Attributes:
+        cut_datagrams: how many were longer than what is taken in at a time, and lost their end.
+    """
+
+    cut_datagrams: int
 
     def fileno(self) -> int: ...
 
@@ -55,6 +61,7 @@ class _Udp:
         family, _, _, _, address = socket.getaddrinfo(host, endpoint.port, type=socket.SOCK_DGRAM)[0]
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._peer: Any = None
+        self.cut_datagrams = 0
         try:
             self._socket.setblocking(False)
             if self._listen:
@@ -72,12 +79,13 @@ class _Udp:
         got: list[tuple[bytes, Any]] = []
         size = 0
         # Bounded, so that a flood leaves time to speak; the rest waits in the socket, and select tells of it at once.
-        while size < _IN_LIMIT_BYTES and len(got) < _IN_LIMIT_DATAGRAMS:
+        while size < IN_LIMIT_BYTES and len(got) < _IN_LIMIT_DATAGRAMS:
             try:
                 data, peer = self._socket.recvfrom(65535)
-                # A datagram holds a frame or a few. One longer than any router makes is cut: nobody's message is lost
-                # by that, and what waits behind it is heard the sooner.
-                got.append((data[:_IN_LIMIT_BYTES], peer))
+                # A datagram holds a frame or a few. One longer than any router makes is cut, so that what waits behind
+                # it is heard the sooner.
+                got.append((data[:IN_LIMIT_BYTES], peer))
+                self.cut_datagrams += len(data) > IN_LIMIT_BYTES
                 size += len(data)
             except (BlockingIOError, InterruptedError):
                 break
@@ -125,13 +133,14 @@ class _ByteStream:
     def __init__(self, device: _Device, name: str) -> None:
         self._device, self._name = device, name
         self._out = bytearray()
+        self.cut_datagrams = 0
 
     def fileno(self) -> int:
         return self._device.fileno()
 
     def receive(self) -> list[tuple[bytes, Any]]:
         try:
-            data = os.read(self._device.fileno(), _IN_LIMIT_BYTES)
+            data = os.read(self._device.fileno(), IN_LIMIT_BYTES)
         except (BlockingIOError, InterruptedError):
             return []
         if not data:

@@ -1,0 +1,234 @@
+"""What others are told of the flight: the autopilot, the ground station, the bus, the recorder, systemd and the log."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Callable
+
+from ortholoc_edge.adapters import systemd
+from ortholoc_edge.adapters.bus import AutopilotRecord, Bus
+from ortholoc_edge.adapters.computer import ComputerReader
+from ortholoc_edge.adapters.mavlink import AutopilotLink, LinkOptions, Severity, Statistic, SystemStatus
+from ortholoc_edge.adapters.mavlink.audit import Level
+from ortholoc_edge.adapters.mavlink.checkup import Checkup
+from ortholoc_edge.adapters.mavlink.herald import Herald
+from ortholoc_edge.adapters.mavlink.sources import SourceSwitch, Withheld
+from ortholoc_edge.adapters.recorder import Recorder
+from ortholoc_edge.pipeline.frame import Frame
+from ortholoc_edge.pipeline.navigator import Navigator
+from ortholoc_edge.pipeline.outcome import Fix, Outcome
+from ortholoc_edge.pipeline.tracker import TrackerStatus
+from ortholoc_edge.pipeline.witness import Consistency, WitnessReport
+from ortholoc_edge.tiles.store import MapStore
+from ortholoc_edge.vehicle import Vehicle
+
+logger = logging.getLogger(__name__)
+
+_S = 1_000_000_000
+
+_INTERVAL_NS = 1 * _S
+_FRESH_NS = 3 * _S
+_MOST_AUDIT_TEXTS = 3
+# A state that lasts is said when it begins, and again this long after.
+_TELL_AGAIN_NS = 30 * _S
+
+OutcomeListener = Callable[[Frame | None, Outcome], None]
+
+
+class Reporter:
+    """Tells outcomes as they come, and everything else once a second. Used by one thread, but for `statistics`."""
+
+    def __init__(
+        self,
+        link: AutopilotLink,
+        options: LinkOptions,
+        lever_arm_m: tuple[float, float, float],
+        vehicle: Vehicle,
+        navigator: Navigator,
+        store: MapStore,
+        counts: Counter[str],
+        *,
+        bus: Bus | None = None,
+        recorder: Recorder | None = None,
+        on_outcome: OutcomeListener | None = None,
+    ) -> None:
+        """
+        Args:
+            options, lever_arm_m: as configured; the autopilot's settings are held against them.
+            counts: the daemon's, to which ours are added.
+            on_outcome: told of every outcome; must return at once.
+        """
+        self._link, self._vehicle, self._navigator, self._store = link, vehicle, navigator, store
+        self._options, self._counts = options, counts
+        self._bus, self._recorder, self._on_outcome = bus, recorder, on_outcome
+        self._computer = ComputerReader()
+        self._checkup: Checkup | None = Checkup(link, options, lever_arm_m=lever_arm_m, ages=link.ages)
+        self._findings_told: set[str] = set()
+        self._damage_told = 0
+        self._herald = Herald()
+        self._sources = SourceSwitch(options)
+        self._last_ns = 0
+        self._last_fix_ns: int | None = None
+        self._origin_told_ns: int | None = None
+
+    def statistics(self) -> dict[str, Statistic]:
+        """Counters since the start: the daemon's, the recorder's and the bus's drops, and the link's under ``link.``;
+        the rung of detail that frames are localized at, and whether GNSS agrees with the fixes."""
+        witness = self._navigator.tracker.witness.report
+        return {
+            **self._counts,
+            "sent": self._link.fixes_sent,
+            "rung": self._navigator.ladder.rung,
+            "gnss_consistency": witness.state.value,
+            "gnss_apart_m": witness.apart_m,
+            "map_files_damaged": len(self._store.damaged),
+            "log_dropped": 0 if self._recorder is None else self._recorder.dropped,
+            "bus_dropped": 0 if self._bus is None else self._bus.dropped,
+            **{f"link.{name}": value for name, value in self._link.statistics().items()},
+        }
+
+    def publish(self, frame: Frame | None, outcome: Outcome) -> None:
+        """What a frame came to."""
+        if isinstance(outcome, Fix):
+            self._last_fix_ns = outcome.stamp_ns
+        self._counts["fixes" if isinstance(outcome, Fix) else "rejected"] += 1
+        if self._recorder is not None:
+            self._recorder.put(frame.name if frame is not None else None, outcome)
+        if self._bus is not None:
+            self._bus.publish(outcome)
+        if self._on_outcome is not None:
+            self._on_outcome(frame, outcome)
+
+    def step(self, now_ns: int) -> None:
+        """To be called often; does its work once a second."""
+        if now_ns - self._last_ns < _INTERVAL_NS:
+            return
+        self._last_ns = now_ns
+        # Others hear of what was sent: a fix that nobody is told of, for want of an origin, say, serves nobody.
+        active = self._link.sent_since(now_ns - _FRESH_NS)
+        self._link.set_system_status(SystemStatus.ACTIVE if active else SystemStatus.STANDBY)
+        # First what steers: a defect in what is only told must not keep it from being done.
+        self._switch_sources(self._navigator.tracker.witness.report.state, now_ns)
+        self._report_autopilot(now_ns)
+        self._link.report_computer(self._computer.read())
+        counts = self._counts
+        systemd.notify(f"STATUS={self._status(now_ns)}, {counts['fixes']} fixes, {counts['rejected']} rejected")
+        if self._link.connected():
+            self._report_damage()
+            self._report_audit(now_ns)
+            self._report_origin(now_ns)
+
+    def _status(self, now_ns: int) -> TrackerStatus:
+        """By the age of the last fix, not by what the last frame came to: a camera that hangs gives no frame."""
+        if self._last_fix_ns is not None and now_ns - self._last_fix_ns < _FRESH_NS:
+            return TrackerStatus.TRACK
+        status = self._navigator.tracker.status
+        return TrackerStatus.COAST if status is TrackerStatus.TRACK else status
+
+    def _report_origin(self, now_ns: int) -> None:
+        last_ns, told_ns = self._vehicle.no_origin_ns, self._origin_told_ns
+        if last_ns is None or now_ns - last_ns >= _FRESH_NS:
+            return
+        if told_ns is None or now_ns - told_ns >= _TELL_AGAIN_NS:
+            self._origin_told_ns = now_ns
+            self._link.send_status_text(Severity.WARNING, "OrthoLoC: EKF origin unknown, fixes not sent")
+
+    def _report_autopilot(self, now_ns: int) -> None:
+        """Say and publish what the autopilot does with the fixes and whether GNSS agrees with them."""
+        fusion, witness = self._link.fusion, self._navigator.tracker.witness.report
+        for severity, text in self._herald.tell(fusion, witness):
+            logger.log(logging.INFO if severity >= Severity.NOTICE else logging.WARNING, "%s", text)
+            self._link.send_status_text(severity, text)
+        if self._bus is not None:
+            self._bus.publish_autopilot(autopilot_record(now_ns, self._link, witness, self._sources.on_vision))
+
+    def _switch_sources(self, consistency: Consistency, now_ns: int) -> None:
+        """Command the autopilot's source set where that was enabled; announce what it took."""
+        outcome = self._link.source_set_outcome()
+        if outcome is not None:
+            taken = self._sources.settle(outcome, now_ns)
+            if taken is not None:
+                logger.warning("%s", taken.text)
+                self._counts[f"switched_to_{taken.source}"] += 1
+                self._link.send_status_text(Severity.WARNING, taken.text)
+            elif not outcome.accepted:
+                why = "no answer" if outcome.answer is None else f"result {outcome.answer}"
+                logger.warning("EKF source set %d was not taken (%s); tried again later", outcome.number, why)
+                self._counts["switches_not_taken"] += 1
+        vehicle, number = self._link.vehicle, self._options.vision_source_set
+        reading = self._link.parameters()[0].get(f"EK3_SRC{number}_POSXY")
+        switch = self._sources.decide(
+            consistency,
+            # Not what we know of where we are, but what the autopilot was told: a set without fixes is no position.
+            self._link.sent_since(now_ns - _FRESH_NS, local=True),
+            vehicle.autopilot if vehicle else None,
+            self._link.restarts,
+            now_ns,
+            vision_posxy=None if reading is None else reading.value,
+        )
+        if isinstance(switch, Withheld):
+            logger.warning("%s: set it, or [link] vision_source_set; GNSS is bad and stays in use", switch.text)
+            self._link.send_status_text(Severity.WARNING, switch.text)
+        elif switch is not None:
+            logger.warning("commanding EKF source set %d (%s)", switch.number, switch.source)
+            self._link.take_source_set(switch.number)
+
+    def _report_audit(self, now_ns: int) -> None:
+        """Say once what is wrong with the autopilot's settings; of its delays as soon as our latency is known."""
+        if self._checkup is None or not self._checkup.step(now_ns):
+            return
+        findings = [
+            finding
+            for finding in self._checkup.findings()
+            if finding.level is not Level.NOTE and finding.subject not in self._findings_told
+        ]
+        if self._link.ages() is not None:
+            self._checkup = None
+        self._findings_told.update(finding.subject for finding in findings)
+        for finding in findings:
+            logger.warning(
+                "autopilot: %s is %s, wanted %s: %s; %s",
+                finding.subject, finding.found, finding.wanted, finding.why, finding.remedy,
+            )  # fmt: skip
+        errors = [finding for finding in findings if finding.level is Level.ERROR and finding.change is not None]
+        for finding in errors[:_MOST_AUDIT_TEXTS]:
+            text = f"OrthoLoC: {finding.subject} is {finding.found}, wants {finding.wanted}"
+            self._link.send_status_text(Severity.WARNING, text)
+        if len(errors) > _MOST_AUDIT_TEXTS:
+            self._link.send_status_text(Severity.WARNING, f"OrthoLoC: {len(errors)} settings wrong, see doctor")
+        self._counts["audit_findings"] = len(self._findings_told)
+
+    def _report_damage(self) -> None:
+        """Say that the map has holes: once the autopilot is there, and again if more are found in flight."""
+        damaged = self._store.damaged
+        if len(damaged) == self._damage_told:
+            return
+        self._damage_told = len(damaged)
+        logger.warning("holes in the map: %d files are damaged or missing, the last %s", len(damaged), damaged[-1])
+        self._link.send_status_text(Severity.WARNING, f"OrthoLoC: {len(damaged)} map files damaged")
+
+
+def autopilot_record(now_ns: int, link: AutopilotLink, witness: WitnessReport, on_vision: bool) -> AutopilotRecord:
+    """What is published of the autopilot."""
+    fusion, advice = link.fusion, link.delay_advice
+    median_ms, p99_ms = link.latency_ms
+
+    def age_s(since_ns: int) -> float | None:
+        return (now_ns - since_ns) / _S if since_ns else None
+
+    return AutopilotRecord(
+        stamp_ns=now_ns,
+        connected=link.connected(),
+        fusion=fusion.state.value,
+        fusion_since_s=age_s(fusion.since_ns),
+        fusion_reason=fusion.reason,
+        gnss=witness.state.value,
+        gnss_since_s=age_s(witness.since_ns),
+        gnss_apart_m=witness.apart_m,
+        gnss_height_apart_m=witness.height_apart_m,
+        latency_median_ms=median_ms,
+        latency_p99_ms=p99_ms,
+        delay_advice=None if advice is None else str(advice),
+        on_vision=on_vision,
+    )
