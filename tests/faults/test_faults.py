@@ -167,12 +167,12 @@ def test_photo_of_another_place(matcher: Matcher, localizer_of: Callable[..., Lo
     foreign = sequence.read_flight(rendered.REAL / "caliterra")
     localizers = {record.camera: localizer_of(store, matcher, record.camera) for record in foreign}
     outcomes = []
-    for index, record in enumerate(foreign[::4]):
-        for place in there[index::10]:
+    for index, record in enumerate(foreign[::5]):
+        for place in there[index::14]:
             frame = Frame(0, record.image(), f"{record.name} at {place.name}")
             prior = rendered.prior(place.map_from_camera, sigma_m=(10.0, 10.0))
             outcomes.append(localizers[record.camera].localize(frame, prior))
-    assert len(outcomes) >= 6
+    assert len(outcomes) >= 3
     assert [o for o in outcomes if isinstance(o, Fix)] == []
     # It was the pictures that did not fit, not the places.
     assert not {o.reason for o in outcomes} & {Reason.OUTSIDE_MAP, Reason.MAP_NODATA, Reason.PRIOR_TOO_WIDE}
