@@ -66,7 +66,7 @@ def fly(mode: str, latency_s: float, jitter_s: float, viso_ms: float, seconds: f
             sample = loop.samples[-1]
             difference = (sample.estimate_m - sample.true_m)[:2]
             errors.append(float(np.hypot(*difference)))
-            ratios.append(float(difference @ difference) / 2.0 / float(loop.autopilot.filter.covariance[0, 0]))
+            ratios.append(float(difference @ difference) / 2.0 / float(loop.autopilot.filter.variance_m2.mean()))
     return np.array(errors), np.array(ratios)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_sim.autopilot import AutopilotCore, AutopilotOptions, Message
+from ortholoc_sim.gnss import GnssEvent, gnss_at
 from ortholoc_sim.site import Site
 from ortholoc_sim.vehicle import Guidance, Truth, Vehicle, VehicleOptions, wrapped
 
@@ -29,12 +30,14 @@ class LoopOptions:
         route_map_m: (N, 3) waypoints in map coordinates; the flight starts at the first, ``climb_m`` below.
         speed_m_s: over ground.
         gnss_until_s: after the start; then it is gone.
+        gnss: what else happens to it.
     """
 
     route_map_m: FloatArray
     speed_m_s: float = 9.0
     climb_m: float = 20.0
     gnss_until_s: float = 10.0
+    gnss: tuple[GnssEvent, ...] = ()
     vehicle: VehicleOptions = field(default_factory=VehicleOptions)
     autopilot: AutopilotOptions = field(default_factory=AutopilotOptions)
     seed: int = 1
@@ -81,6 +84,8 @@ class ClosedLoop:
             options.vehicle, start, np.zeros(3), float(np.arctan2(course[1], course[0])), options.seed
         )
         self.autopilot = AutopilotCore(options.autopilot, site, self._vehicle.truth)
+        self.autopilot.mission.set_route(np.array(route))
+        self._revision = self.autopilot.mission.revision
         self.samples: list[Sample] = []
         self._stamps: list[int] = []
 
@@ -112,11 +117,17 @@ class ClosedLoop:
     def _step(self) -> list[Message]:
         dt = STEP_NS / _S
         autopilot, vehicle = self.autopilot, self._vehicle
+        if autopilot.mission.revision != self._revision:
+            self._revision = autopilot.mission.revision
+            self._guidance = Guidance(autopilot.route(), self.options.speed_m_s)
+        autopilot.mission.current = autopilot.mission.first_target + self._guidance.leg
         velocity, heading = self._guidance.wanted(autopilot.position_ned_m)
         yaw = rotation.to_euler(autopilot.ned_from_body)[2]
         vehicle.step(dt, velocity - autopilot.velocity_ned_m_s, wrapped(heading - yaw))
         self._now_ns += STEP_NS
-        autopilot.gnss = self._now_ns < self.gnss_lost_ns
+        signal = gnss_at(self.options.gnss, (self._now_ns - self._start_ns) / _S)
+        autopilot.gnss = signal.available and self._now_ns < self.gnss_lost_ns
+        autopilot.gnss_offset_m, autopilot.gnss_noise = signal.offset_ned_m, signal.noise
         truth = vehicle.truth
         out = autopilot.step(self.boot_ns(self._now_ns), truth, dt)
         self.samples.append(
