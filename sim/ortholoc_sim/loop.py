@@ -31,6 +31,7 @@ class LoopOptions:
         speed_m_s: over ground.
         gnss_until_s: after the start; then it is gone.
         gnss: what else happens to it.
+        closed: whether the last waypoint leads to the first again, without an end.
     """
 
     route_map_m: FloatArray
@@ -41,6 +42,7 @@ class LoopOptions:
     vehicle: VehicleOptions = field(default_factory=VehicleOptions)
     autopilot: AutopilotOptions = field(default_factory=AutopilotOptions)
     seed: int = 1
+    closed: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,7 +81,7 @@ class ClosedLoop:
         ]
         start = site.ned_from_map(options.route_map_m[0]) + np.array([0.0, 0.0, options.climb_m])
         course = route[1] - route[0]
-        self._guidance = Guidance(np.array(route), options.speed_m_s)
+        self._guidance = Guidance(np.array(route), options.speed_m_s, closed=options.closed)
         self._vehicle = Vehicle(
             options.vehicle, start, np.zeros(3), float(np.arctan2(course[1], course[0])), options.seed
         )
@@ -103,6 +105,10 @@ class ClosedLoop:
         """The autopilot's clock at ``now_ns`` of the owner's."""
         return now_ns - self._start_ns + self.options.autopilot.boot_offset_ns
 
+    def owner_ns(self, boot_ns: int) -> int:
+        """The owner's clock at a time of the autopilot's."""
+        return boot_ns - self.boot_ns(self._start_ns) + self._start_ns + self.autopilot.rebooted_ns
+
     def receive(self, messages: list[Message], now_ns: int) -> list[Message]:
         """Hand over messages that arrived; returns the answers."""
         return [answer for message in messages for answer in self.autopilot.handle(message, self.boot_ns(now_ns))]
@@ -120,7 +126,7 @@ class ClosedLoop:
         if autopilot.mission.revision != self._revision:
             self._revision = autopilot.mission.revision
             self._guidance = Guidance(autopilot.route(), self.options.speed_m_s)
-        autopilot.mission.current = autopilot.mission.first_target + self._guidance.leg
+        autopilot.mission.current = autopilot.mission.target(self._guidance.leg)
         velocity, heading = self._guidance.wanted(autopilot.position_ned_m)
         yaw = rotation.to_euler(autopilot.ned_from_body)[2]
         vehicle.step(dt, velocity - autopilot.velocity_ned_m_s, wrapped(heading - yaw))

@@ -131,7 +131,8 @@ def wrapped(angle_rad: float) -> float:
 
 @dataclass(slots=True)
 class Guidance:
-    """Flies along waypoints (N, 3) NED in the autopilot's local frame at ``speed_m_s``; hovers over the last.
+    """Flies along waypoints (N, 3) NED in the autopilot's local frame at ``speed_m_s``; hovers over the last, or goes
+    on to the first where the route is ``closed``.
 
     Corners are cut by aiming at a point ``lookahead_m`` ahead on the route.
     """
@@ -141,13 +142,16 @@ class Guidance:
     climb_m_s: float = 2.5
     lookahead_m: float = 12.0
     leg: int = 0
+    closed: bool = False
 
     def wanted(self, position_ned_m: FloatArray) -> tuple[FloatArray, float]:
         """Velocity (3,) NED m/s and heading (rad, true) for an estimated position."""
-        points = self.waypoints_ned_m
-        while self.leg < len(points) - 2 and self._along(position_ned_m) > self._length() - 1.2 * self.lookahead_m:
-            self.leg += 1
-        start, end = points[self.leg], points[self.leg + 1]
+        # Each leg once at most, whatever the route.
+        for _ in range(len(self.waypoints_ned_m)):
+            if self._is_last or self._along(position_ned_m) <= self._length() - 1.2 * self.lookahead_m:
+                break
+            self.leg = (self.leg + 1) % len(self.waypoints_ned_m)
+        start, end = self._ends()
         length = self._length()
         course = (end - start) / max(length, 1e-6)
         along = self._along(position_ned_m)
@@ -155,7 +159,7 @@ class Guidance:
         to_aim = aim - position_ned_m
         flat = float(np.hypot(to_aim[0], to_aim[1]))
         speed = self.speed_m_s
-        if self.leg == len(points) - 2:  # brake for the end of the route
+        if self._is_last:  # brake for the end of the route
             speed = min(speed, 0.4 * float(np.hypot(*(end - position_ned_m)[:2])))
         velocity = np.zeros(3)
         if flat > 1e-3:
@@ -163,11 +167,19 @@ class Guidance:
         velocity[2] = float(np.clip(0.6 * to_aim[2], -self.climb_m_s, self.climb_m_s))
         return velocity, float(np.arctan2(course[1], course[0]))
 
+    @property
+    def _is_last(self) -> bool:
+        return not self.closed and self.leg == len(self.waypoints_ned_m) - 2
+
+    def _ends(self) -> tuple[FloatArray, FloatArray]:
+        points = self.waypoints_ned_m
+        return points[self.leg], points[(self.leg + 1) % len(points)]
+
     def _length(self) -> float:
-        start, end = self.waypoints_ned_m[self.leg], self.waypoints_ned_m[self.leg + 1]
+        start, end = self._ends()
         return float(np.hypot(*(end - start)[:2]))
 
     def _along(self, position_ned_m: FloatArray) -> float:
-        start, end = self.waypoints_ned_m[self.leg], self.waypoints_ned_m[self.leg + 1]
+        start, end = self._ends()
         course = (end - start)[:2] / max(self._length(), 1e-6)
         return float((position_ned_m - start)[:2] @ course)

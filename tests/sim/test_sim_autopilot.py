@@ -38,7 +38,8 @@ BOOT = 1000 * S
 OUR_OFFSET = 7_000 * S + 12_345  # the companion's clock minus boot time
 QUIET = SensorOptions(
     tilt_deg=0.0, yaw_bias_deg=0.0, yaw_deg=0.0, gyro_bias_deg_s=0.0, gyro_noise_deg_s=0.0, acceleration_bias=0.0,
-    accelerometer_bias=0.0, acceleration_noise=0.0, climb_m_s=0.0, gnss_m=1e-6, gnss_velocity_m_s=1e-6, baro_walk_m=0.0, baro_noise_m=0.0,
+    accelerometer_bias=0.0, acceleration_noise=0.0, climb_m_s=0.0,
+    gnss_m=1e-6, gnss_velocity_m_s=1e-6, baro_walk_m=0.0, baro_noise_m=0.0,
 )  # fmt: skip
 
 

@@ -101,7 +101,7 @@ class AutopilotCore:
         self._shadow: FloatArray | None = None
         self._shadow_drift = np.zeros(2)
         self._boot_ns = 0
-        self._rebooted_ns: int | None = None
+        self._rebooted_ns = 0
         self._start()
         self.estimator.filter.reckoned_m = self._true_m[:2].copy()
         self.estimator.ned_from_body = truth.ned_from_body
@@ -208,6 +208,10 @@ class AutopilotCore:
         """(3,) where it really is, in its own frame."""
         return self._true_m
 
+    def public_from_inner(self, position_ned_m: FloatArray) -> FloatArray:
+        """(3,) a position of the site's frame as others see it: from the EKF origin."""
+        return self._frame.public_from_inner(position_ned_m)
+
     def route(self) -> FloatArray:
         """(N, 3) its mission from where it believes to be, in its own frame; for the owner to fly."""
         home = self._home or self._site.origin
@@ -225,9 +229,10 @@ class AutopilotCore:
 
     # -- time --------------------
 
-    def _clock_ns(self, boot_ns: int) -> int:
-        """Since the last restart, of the owner's boot time."""
-        return boot_ns if self._rebooted_ns is None else boot_ns - self._rebooted_ns
+    @property
+    def rebooted_ns(self) -> int:
+        """Boot time of the owner's when it restarted last; 0 if it never did."""
+        return self._rebooted_ns
 
     def step(self, boot_ns: int, truth: Truth, dt_s: float) -> list[Message]:
         """Move sensors and filter to ``boot_ns``; returns what it sends.
@@ -236,7 +241,7 @@ class AutopilotCore:
             boot_ns: since the autopilot was switched on first; its own clock begins anew when it restarts.
             truth: of the simulation's NED.
         """
-        self._boot_ns = boot_ns = self._clock_ns(boot_ns)
+        self._boot_ns = boot_ns = boot_ns - self._rebooted_ns
         self._truth = truth
         self._true_m = self._site.autopilot_from_ned(truth.position_ned_m)
         readings = self.sensors.step(boot_ns, truth, self._true_m, dt_s)
@@ -255,7 +260,7 @@ class AutopilotCore:
     def reboot(self) -> None:
         """Restart: its clock, streams and filter begin anew, parameters that wait for it take effect. The mission
         stays. The vehicle is taken to stay in the air meanwhile, and where it believed to be."""
-        self._rebooted_ns = self._boot_ns if self._rebooted_ns is None else self._rebooted_ns + self._boot_ns
+        self._rebooted_ns += self._boot_ns
         self._boot_ns = 0
         self._frame.origin = None
         self.parameters.reboot()
@@ -300,7 +305,7 @@ class AutopilotCore:
 
     def handle(self, message: Message, boot_ns: int) -> list[Message]:
         """Take in a message that arrived at ``boot_ns``; returns the answers."""
-        boot_ns = self._clock_ns(boot_ns)
+        boot_ns = boot_ns - self._rebooted_ns
         name = message.get_type()
         self.counts[name] += 1
         if not self._is_for_us(message):

@@ -44,7 +44,7 @@ class Mission:
     Attributes:
         MESSAGES: names of those that `handle` knows.
         items: as uploaded. ArduPilot's item 0 is home and not flown.
-        current: the item that is flown; set by the owner. first_target: the item that the first leg goes to.
+        current: the item that is flown; set by the owner.
         revision: rises with each mission that came whole.
     """
 
@@ -56,7 +56,7 @@ class Mission:
     def __init__(self, stack: Stack, frame: LocalFrame) -> None:
         self._stack, self._frame = stack, frame
         self.items: list[Item] = []
-        self.current = self.first_target = 0
+        self.current = self._first_target = 0
         self.revision = 0
         self._upload: list[Item] | None = None
         self._count = self._attempts = self._due_ns = 0
@@ -77,6 +77,11 @@ class Mission:
         """Index of the first item that is flown."""
         return 1 if self._stack == "ardupilot" else 0
 
+    def target(self, leg: int) -> int:
+        """Index of the item to which a leg of the route leads."""
+        count = len(self.items) - self.first
+        return self.first + (self._first_target - self.first + leg) % count if count > 0 else 0
+
     def set_route(self, waypoints_ned_m: FloatArray) -> None:
         """Take (N, 3) positions of the filter's frame, N >= 2, as the mission."""
         points = [self._frame.geopoint(np.asarray(p, dtype=np.float64)) for p in waypoints_ned_m]
@@ -89,7 +94,7 @@ class Mission:
         ]  # fmt: skip
         self.items = [items[0], *items] if self._stack == "ardupilot" else items
         # The flight begins at the first waypoint and goes to the second.
-        self.current = self.first_target = self.first + 1
+        self.current = self._first_target = self.first + 1
 
     def route(self, home: Geopoint, start_ned_m: FloatArray) -> FloatArray:
         """(N, 3) positions of the filter's frame: where it is now, then each item that is a place."""
@@ -123,7 +128,7 @@ class Mission:
         return self._tell(m.seq) if m.seq < len(self.items) else self._ack(dialect.MAV_MISSION_INVALID_SEQUENCE)
 
     def _on_clear(self, m: Message, now_ns: int) -> Message:
-        self.items, self.current, self.first_target = [], 0, 0
+        self.items, self.current, self._first_target = [], 0, 0
         self.revision += 1
         return self._ack(dialect.MAV_MISSION_ACCEPTED)
 
@@ -173,7 +178,7 @@ class Mission:
         if len(upload) < self._count:
             return self._ask(now_ns)
         self.items, self._upload = upload, None
-        self.current = self.first_target = self.first
+        self.current = self._first_target = self.first
         self.revision += 1
         return self._ack(dialect.MAV_MISSION_ACCEPTED)
 

@@ -69,7 +69,9 @@ class Imu:
     def __init__(self, options: SensorOptions, rng: np.random.Generator) -> None:
         self._options, self._rng = options, rng
         towards = rng.uniform(0.0, 2.0 * math.pi)
-        self.accelerometer_bias_m_s2 = options.accelerometer_bias * np.array([math.cos(towards), math.sin(towards), 0.0])
+        self.accelerometer_bias_m_s2 = options.accelerometer_bias * np.array(
+            [math.cos(towards), math.sin(towards), 0.0]
+        )
         self._gyro_bias = math.radians(options.gyro_bias_deg_s) * rng.standard_normal(3)
 
     def specific_force(self, acceleration_ned_m_s2: FloatArray, ned_from_body: FloatArray, dt_s: float) -> FloatArray:
