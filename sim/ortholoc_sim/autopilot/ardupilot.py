@@ -232,7 +232,7 @@ class ArduPilot(Estimator):
         )
         return min(boot_ns, max(delayed, boot_ns - _BUFFER_NS))
 
-    def _sigma_m(self, covariance: list[float], boot_ns: int) -> float:
+    def _sigma_m(self, covariance: list[float]) -> float:
         """Of one axis, as AP_VisualOdom and then EKF3 bound it."""
         sigma = position_sigma_m(covariance, self.options.firmware)
         if math.isnan(sigma):
@@ -259,6 +259,7 @@ class ArduPilot(Estimator):
         changed = known is not None and counter != known
         if kind in (_VISO_MAVLINK, _VISO_T265, _VISO_VOXL):
             self._heard_ns, self._counter = boot_ns, counter
+            sigma = self._sigma_m(covariance)
             if changed and kind == _VISO_T265:
                 self._ignored_until_ns = boot_ns + _T265_IGNORED_NS
         refused = self._refusal(kind, quality, position, capture_ns, boot_ns)
@@ -266,7 +267,6 @@ class ArduPilot(Estimator):
             verdict, why = refused
         else:
             self._last_stamp_ns = capture_ns
-            sigma = self._sigma_m(covariance, boot_ns)
             scale = self._parameters.active("VISO_SCALE")
             measured = (position * scale - self._lever_arm("VISO_POS_X", "VISO_POS_Y", "VISO_POS_Z"))[:2]
             if changed and kind == _VISO_VOXL:
