@@ -28,6 +28,7 @@ from ortholoc_edge.clock import Clock, SystemClock
 from ortholoc_edge.errors import ConfigError, OrtholocError
 from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_sim.autopilot import (
+    Airframe,
     AutopilotOptions,
     FilterOptions,
     LineOptions,
@@ -39,6 +40,7 @@ from ortholoc_sim.autopilot import (
     UdpPort,
     VisionRecord,
 )
+from ortholoc_sim.fixed_wing import FixedWingOptions
 from ortholoc_sim.gnss import GnssEvent
 from ortholoc_sim.loop import STEP_NS, ClosedLoop, LoopOptions
 from ortholoc_sim.route import circle, read_waypoints, site_at
@@ -48,6 +50,7 @@ from ortholoc_sim.vehicle import VehicleOptions
 _S = 1_000_000_000
 _HOME = Geopoint(48.8026, 11.0033, 382.7)
 _NEVER_S = 1e9
+_SPEED_M_S: dict[Airframe, float] = {"multirotor": 9.0, "fixed-wing": 18.0}
 _MOST_WAIT_S = 0.05
 
 Event = dict[str, Any]
@@ -63,7 +66,8 @@ class LinkSpec:
             has spoken, UDP only. line: what lies between.
         home: centre of the circle, and where heights count from.
         route: "circle" around home, or a waypoint file (QGC WPL 110).
-        radius_m, height_m: of the circle. speed_m_s: over ground.
+        radius_m, height_m: of the circle.
+        airframe: what flies. speed_m_s: over ground; None: 9, or 18 of a fixed wing.
         gnss: what happens to it, see `GnssEvent`.
         wind_ned_m_s, gust_m_s: wind.
         stock: parameters as they come from the factory instead of set up for vision. parameters: set over them.
@@ -83,7 +87,8 @@ class LinkSpec:
     route: str = "circle"
     radius_m: float = 150.0
     height_m: float = 100.0
-    speed_m_s: float = 9.0
+    airframe: Airframe = "multirotor"
+    speed_m_s: float | None = None
     gnss: tuple[GnssEvent, ...] = ()
     wind_ned_m_s: tuple[float, float, float] = (1.5, -1.0, 0.0)
     gust_m_s: float = 0.6
@@ -96,6 +101,12 @@ class LinkSpec:
     system_id: int = 1
     seed: int = 1
     sensors: SensorOptions = field(default_factory=SensorOptions)
+
+    def vehicle(self) -> VehicleOptions | FixedWingOptions:
+        """What flies, in this wind."""
+        if self.airframe == "fixed-wing":
+            return FixedWingOptions(wind_ned_m_s=self.wind_ned_m_s, gust_m_s=self.gust_m_s)
+        return VehicleOptions(wind_ned_m_s=self.wind_ned_m_s, gust_m_s=self.gust_m_s)
 
     def autopilot(self) -> AutopilotOptions:
         """Raises: ConfigError for a firmware that is not simulated."""
@@ -153,10 +164,10 @@ class SimulatedLink:
         closed = spec.route == "circle"
         route = circle(site, spec.radius_m, spec.height_m) if closed else read_waypoints(Path(spec.route), site)
         self._site = site
+        speed_m_s = spec.speed_m_s if spec.speed_m_s is not None else _SPEED_M_S[spec.airframe]
         options = LoopOptions(
-            route, spec.speed_m_s, climb_m=0.0, gnss_until_s=_NEVER_S, gnss=spec.gnss,
-            vehicle=VehicleOptions(wind_ned_m_s=spec.wind_ned_m_s, gust_m_s=spec.gust_m_s), autopilot=autopilot,
-            seed=spec.seed, closed=closed,
+            route, speed_m_s, climb_m=0.0, gnss_until_s=_NEVER_S, gnss=spec.gnss, vehicle=spec.vehicle(),
+            autopilot=autopilot, seed=spec.seed, closed=closed,
         )  # fmt: skip
         self._lock = threading.RLock()
         self._stop = threading.Event()
@@ -391,7 +402,8 @@ def _arguments() -> argparse.ArgumentParser:
     flight = parser.add_argument_group("the flight")
     flight.add_argument("--home", metavar="LAT,LON,AMSL", help="default: 48.8026,11.0033,382.7")
     flight.add_argument("--route", default="circle", metavar="FILE|circle", help="a QGC WPL 110 file, or around home")
-    flight.add_argument("--speed", type=float, default=9.0, metavar="M/S", help="over ground (%(default)s)")
+    flight.add_argument("--airframe", choices=("multirotor", "fixed-wing"), default="multirotor")
+    flight.add_argument("--speed", type=float, metavar="M/S", help="over ground (9, a fixed wing 18)")
     flight.add_argument("--wind", default="1.5,-1", metavar="N,E", help="m/s that the air moves north and east")
     flight.add_argument("--gnss-loss-at", type=float, metavar="S")
     flight.add_argument("--gnss-back-at", type=float, metavar="S")
@@ -469,6 +481,7 @@ def spec_of(args: argparse.Namespace) -> LinkSpec:
         line=None if line == LineOptions() else line,
         home=home,
         route=args.route,
+        airframe=args.airframe,
         speed_m_s=args.speed,
         gnss=gnss,
         wind_ned_m_s=(north, east, 0.0),

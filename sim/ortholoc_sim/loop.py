@@ -13,10 +13,11 @@ import numpy as np
 
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import FloatArray
-from ortholoc_sim.autopilot import AutopilotCore, AutopilotOptions, Message
+from ortholoc_sim.autopilot import Airframe, AutopilotCore, AutopilotOptions, Message
+from ortholoc_sim.fixed_wing import FixedWing, FixedWingOptions
 from ortholoc_sim.gnss import GnssEvent, gnss_at
 from ortholoc_sim.site import Site
-from ortholoc_sim.vehicle import Guidance, Truth, Vehicle, VehicleOptions, wrapped
+from ortholoc_sim.vehicle import Craft, Guidance, Truth, Vehicle, VehicleOptions, wrapped
 
 STEP_NS = 10_000_000
 _S = 1_000_000_000
@@ -28,7 +29,8 @@ class LoopOptions:
 
     Attributes:
         route_map_m: (N, 3) waypoints in map coordinates; the flight starts at the first, ``climb_m`` below.
-        speed_m_s: over ground.
+        speed_m_s: over ground; of a fixed wing as far as its airspeed allows.
+        vehicle: what flies: a multirotor or a fixed wing.
         gnss_until_s: after the start; then it is gone.
         gnss: what else happens to it.
         closed: whether the last waypoint leads to the first again, without an end.
@@ -39,7 +41,7 @@ class LoopOptions:
     climb_m: float = 20.0
     gnss_until_s: float = 10.0
     gnss: tuple[GnssEvent, ...] = ()
-    vehicle: VehicleOptions = field(default_factory=VehicleOptions)
+    vehicle: VehicleOptions | FixedWingOptions = field(default_factory=VehicleOptions)
     autopilot: AutopilotOptions = field(default_factory=AutopilotOptions)
     seed: int = 1
     closed: bool = False
@@ -81,15 +83,31 @@ class ClosedLoop:
         ]
         start = site.ned_from_map(options.route_map_m[0]) + np.array([0.0, 0.0, options.climb_m])
         course = route[1] - route[0]
-        self._guidance = Guidance(np.array(route), options.speed_m_s, closed=options.closed)
-        self._vehicle = Vehicle(
-            options.vehicle, start, np.zeros(3), float(np.arctan2(course[1], course[0])), options.seed
-        )
-        self.autopilot = AutopilotCore(options.autopilot, site, self._vehicle.truth)
+        self._guidance = self._guide(np.array(route), options.closed)
+        heading = float(np.arctan2(course[1], course[0]))
+        self._vehicle: Craft
+        airframe: Airframe
+        if isinstance(options.vehicle, FixedWingOptions):
+            self._vehicle, airframe = FixedWing(options.vehicle, start, heading, options.seed), "fixed-wing"
+        else:
+            self._vehicle = Vehicle(options.vehicle, start, np.zeros(3), heading, options.seed)
+            airframe = "multirotor"
+        self.autopilot = AutopilotCore(options.autopilot, site, self._vehicle.truth, airframe)
         self.autopilot.mission.set_route(np.array(route))
         self._revision = self.autopilot.mission.revision
         self.samples: list[Sample] = []
         self._stamps: list[int] = []
+
+    def _guide(self, route: FloatArray, closed: bool = False) -> Guidance:
+        options = self.options
+        if not isinstance(options.vehicle, FixedWingOptions):
+            return Guidance(route, options.speed_m_s, closed=closed)
+        # It needs room to turn, and cannot hover at the end.
+        wing = options.vehicle
+        return Guidance(
+            route, options.speed_m_s, wing.max_climb_m_s, 2.0 * wing.airspeed_m_s, closed=closed,
+            loiter_radius_m=1.6 * wing.least_turn_radius_m,
+        )  # fmt: skip
 
     @property
     def now_ns(self) -> int:
@@ -125,7 +143,7 @@ class ClosedLoop:
         autopilot, vehicle = self.autopilot, self._vehicle
         if autopilot.mission.revision != self._revision:
             self._revision = autopilot.mission.revision
-            self._guidance = Guidance(autopilot.route(), self.options.speed_m_s)
+            self._guidance = self._guide(autopilot.route())
         autopilot.mission.current = autopilot.mission.target(self._guidance.leg)
         velocity, heading = self._guidance.wanted(autopilot.position_ned_m)
         yaw = rotation.to_euler(autopilot.ned_from_body)[2]

@@ -12,13 +12,14 @@ from ortholoc_sim.autopilot.ardupilot import position_sigma_m
 from ortholoc_sim.autopilot.core import AutopilotCore
 from ortholoc_sim.autopilot.dialect import Message, dialect
 from ortholoc_sim.autopilot.gimbal import GimbalOptions
-from ortholoc_sim.autopilot.options import AutopilotOptions, FilterOptions
+from ortholoc_sim.autopilot.options import Airframe, AutopilotOptions, FilterOptions
 from ortholoc_sim.autopilot.ports import LineOptions, Port, PtyPort, TcpPort, UdpPort
 from ortholoc_sim.autopilot.position_filter import PositionFilter
 from ortholoc_sim.autopilot.records import Verdict, VisionRecord
 from ortholoc_sim.autopilot.sensors import SensorOptions
 
 __all__ = [
+    "Airframe",
     "AutopilotCore",
     "AutopilotOptions",
     "FilterOptions",
