@@ -316,6 +316,9 @@ class AutopilotCore:
                 answers = [dialect.MAVLink_timesync_message(tc1=boot_ns, ts1=message.ts1)]
             else:
                 self.estimator.timesync.answered(message, boot_ns)
+        elif name == "PING":
+            if message.target_system == 0 and message.target_component == 0:
+                answers = [self._pong(message)]
         elif name in ("COMMAND_LONG", "COMMAND_INT"):
             answers = self._command(message, boot_ns)
         elif name in self.estimator.MESSAGES:
@@ -334,6 +337,13 @@ class AutopilotCore:
         """Whether it is addressed to this autopilot, or to all."""
         system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
         return system in (0, self.options.system_id) and component in (0, dialect.MAV_COMP_ID_AUTOPILOT1)
+
+    @staticmethod
+    def _pong(message: Message) -> Message:
+        return dialect.MAVLink_ping_message(
+            time_usec=message.time_usec, seq=message.seq, target_system=message.get_srcSystem(),
+            target_component=message.get_srcComponent(),
+        )  # fmt: skip
 
     def _set_origin(self, message: Message, boot_ns: int) -> list[Message]:
         origin = Geopoint(message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3)
@@ -429,7 +439,8 @@ class AutopilotCore:
             d.MAV_SYS_STATUS_SENSOR_3D_GYRO | d.MAV_SYS_STATUS_SENSOR_3D_ACCEL | d.MAV_SYS_STATUS_SENSOR_3D_MAG
             | d.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE | d.MAV_SYS_STATUS_AHRS
         )  # fmt: skip
-        present, health = flying | d.MAV_SYS_STATUS_SENSOR_GPS, flying
+        # A fence that there is not is not breached.
+        present, health = flying | d.MAV_SYS_STATUS_SENSOR_GPS, flying | d.MAV_SYS_STATUS_GEOFENCE
         health |= d.MAV_SYS_STATUS_SENSOR_GPS if self.estimator.has_gnss else 0
         shown, healthy = self.estimator.vision_health(self._boot_ns)
         present |= d.MAV_SYS_STATUS_SENSOR_VISION_POSITION if shown else 0

@@ -46,7 +46,7 @@ class FilterOptions:
     quality_min: int = 0
     stamps: Literal["timesync", "jitter"] = "timesync"
     converged_after: int = 500
-    drift_noise: float = 0.06
+    drift_noise: float = 0.10
     offset_noise: float = 0.10
 
 
