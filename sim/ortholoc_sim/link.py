@@ -371,12 +371,15 @@ def as_text(event: Event) -> str:
         parts += [] if event["off_m"] is None else [f"{event['off_m']:.2f} m off the truth"]
         why = f" ({event['why']})" if event["why"] else ""
         return f"{start}{event['message']} {event['verdict']}{why}: {', '.join(parts)}"
+    if event["kind"] == "open":
+        return f"{start}{event['firmware']} flies; a companion finds it at {event['endpoint']}"
     if event["kind"] == "text":
         return f"{start}says: {event['text']}"
     if event["kind"] == "state":
         gnss = "GNSS" if event["gnss"] else "no GNSS"
         return f"{start}its position is {event['error_m']:.2f} m off, {gnss}"
-    return f"{start}{event}"
+    heard = ", ".join(f"{name} {count}" for name, count in sorted(event["counts"].items()))
+    return f"{start}landed; it heard {heard}"
 
 
 def _arguments() -> argparse.ArgumentParser:
@@ -511,9 +514,10 @@ def main(argv: list[str] | None = None) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
     try:
-        with SimulatedLink(spec_of(args), tell) as link:
-            options = asdict(link.spec.line) if link.spec.line else {}
-            tell({"kind": "open", "t_s": 0.0, "endpoint": link.endpoint, "firmware": args.firmware, "line": options})
+        link = SimulatedLink(spec_of(args), tell)
+        line = asdict(link.spec.line) if link.spec.line else {}
+        tell({"kind": "open", "t_s": 0.0, "endpoint": link.endpoint, "firmware": args.firmware, "line": line})
+        with link:
             restarts_s = args.reboot_at
             while not ended.wait(0.05) and not link.failed:
                 if args.duration is not None and link.now_s >= args.duration:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 import time
@@ -209,6 +210,24 @@ def test_the_command_tells_events_as_json(tmp_path: Path) -> None:
 def test_what_cannot_be_is_said(arguments: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert tool.main([*arguments, "--duration", "0.1"]) == 1
     assert says in capsys.readouterr().err
+
+
+def test_the_documents_example_runs() -> None:
+    document = Path(__file__).parents[2] / "docs" / "simulated-link.md"
+    [example] = re.findall(r"```python\n(.*?)```", document.read_text(encoding="utf-8"), re.DOTALL)
+    exec(compile(example, str(document), "exec"), {})
+
+
+def test_the_documents_commands_are_understood() -> None:
+    document = (Path(__file__).parents[2] / "docs" / "simulated-link.md").read_text(encoding="utf-8")
+    commands = re.findall(r"^python -m ortholoc_sim\.link (.*)$", document, re.MULTILINE)
+    assert len(commands) >= 7
+    for command in commands:
+        spec = tool.spec_of(tool._arguments().parse_args(command.split()))
+        assert spec.autopilot().stack in ("ardupilot", "px4")
+    every = set(Verdict)
+    told = set(re.findall(r"`(\w+)`", document.split("| `verdict` |")[1].split("## From")[0]))
+    assert {str(verdict) for verdict in every} <= told
 
 
 # -- without sockets -----------------------------------------------------------
