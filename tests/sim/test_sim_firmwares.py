@@ -15,6 +15,8 @@ from oracles.used import Dropped, Used
 from ortholoc_sim.autopilot import AutopilotCore, AutopilotOptions, FilterOptions, Verdict, dialect
 from ortholoc_sim.site import Geopoint, Site
 
+from ortholoc_edge.geometry import rotation
+
 SYNCHRONISED = FilterOptions(converged_after=0)
 
 
@@ -316,6 +318,36 @@ def test_a_spoofed_gnss_takes_it_along(site: Site, stack: str) -> None:
     assert (core.position_ned_m - core.true_position_m)[1] == pytest.approx(15.0, abs=1.0)
 
 
+@pytest.mark.parametrize(
+    ("stack", "firmware", "parameters"),
+    [
+        ("ardupilot", (4, 8, 0), {"EK3_SRC2_POSZ": 6, "EK3_SRC2_YAW": 6}),
+        ("px4", (1, 16, 0), {"EKF2_EV_CTRL": 11, "EKF2_HGT_REF": 3}),
+    ],
+)
+def test_height_and_heading_follow_vision_where_parameters_say_so(
+    site: Site, stack: str, firmware: tuple, parameters: dict
+) -> None:
+    """The barometer is 4 m off, the compass 10 degrees."""
+    there = replace(site, earth=stack)  # type: ignore[arg-type]
+    filters = SYNCHRONISED if stack == "px4" else FilterOptions()
+
+    def seen(parameters: dict) -> tuple[float, float]:
+        sensors = replace(QUIET, yaw_bias_deg=10.0)
+        rig = Rig(there, stack=stack, firmware=firmware, parameters=parameters, filter=filters, sensors=sensors)
+        rig.core.sensors.barometer.drift_m = 4.0
+        rig.fly(0.1)
+        see = rig.see_ned if stack == "px4" else rig.see
+        for _ in range(60):
+            see(rig.at[0], rig.at[1], z=rig.at[2], q=[1.0, 0.0, 0.0, 0.0])
+            rig.fly(0.1)
+        yaw_deg = np.rad2deg(rotation.to_euler(rig.core.ned_from_body)[2])
+        return float(rig.core.position_ned_m[2] - rig.at[2]), abs(float(yaw_deg))
+
+    assert seen(parameters) == pytest.approx((0.0, 0.0), abs=0.6)
+    assert seen({}) == pytest.approx((4.0, 10.0), abs=0.1)
+
+
 # -- both, against other transcriptions ----------------------------------------
 
 
@@ -423,3 +455,66 @@ def test_a_site_of_the_other_stack_is_refused(site: Site) -> None:
     with pytest.raises(ValueError, match="EKF2_EV_CTRL is not one"):
         AutopilotCore(AutopilotOptions(parameters={"EKF2_EV_CTRL": 1}), site, truth())
     assert Geopoint(1.0, 2.0, 3.0).lat_deg == 1.0
+
+
+# -- ArduPilot, against what was measured of a real one (autopilot-contract.md, 2.11) ----------------------------------
+
+MEASURED = {"firmware": (4, 7, 0), "filter": FilterOptions(stamps="jitter")}
+
+
+def held(site: Site, **options: object) -> Rig:
+    """Vision alone has held it for some seconds."""
+    rig = Rig(site, **{**MEASURED, **options})
+    stream(rig, 5.0)
+    return rig
+
+
+def stream(rig: Rig, seconds: float, offset_m: float = 0.0, sigma_m: float = 0.2, **changes: object) -> list[Verdict]:
+    """Ten a second, ``offset_m`` north of the truth."""
+    cube = [0.0] * 21
+    cube[0] = cube[6] = math.sqrt(sigma_m**3 / 2.0)
+    verdicts = []
+    for _ in range(round(seconds * 10)):
+        rig.fly(0.1)
+        verdicts.append(rig.see(rig.at[0] + offset_m, rig.at[1], pose_covariance=cube, **changes))
+    return verdicts
+
+
+def test_measured_a_jump_of_5_m_is_refused_for_about_4_5_s_then_taken(site: Site) -> None:
+    rig = held(site)
+    verdicts = stream(rig, 9.0, offset_m=5.0)
+    assert verdicts[0] is Verdict.GATED
+    taken = next(n for n, verdict in enumerate(verdicts) if verdict is not Verdict.GATED)
+    assert verdicts[taken] is Verdict.FUSED  # its own doubt has grown that far; no time-out
+    assert taken / 10 == pytest.approx(4.5, abs=1.5)
+
+
+def test_measured_with_a_new_reset_counter_it_is_taken_at_once(site: Site) -> None:
+    rig = held(site)
+    assert stream(rig, 0.1, offset_m=5.0, reset_counter=1) == [Verdict.RESET]
+    assert rig.error[0] == pytest.approx(5.0, abs=0.1)
+
+
+def test_measured_the_gate_is_about_seven_declared_sigmas(site: Site) -> None:
+    """For a filter that is much surer than the measurement."""
+    for times, verdict in ((6.0, Verdict.FUSED), (8.5, Verdict.GATED)):
+        assert stream(held(site), 0.1, offset_m=times * 2.0, sigma_m=2.0) == [verdict]
+
+
+def test_measured_half_of_the_fixes_may_be_wild(site: Site) -> None:
+    rig = held(site)
+    for n in range(60):
+        stream(rig, 0.1, offset_m=30.0 if n % 2 else 0.0)
+    assert np.hypot(*rig.error) < 0.1
+
+
+@pytest.mark.parametrize(("parameter_ms", "off_m"), [(10.0, 0.95), (200.0, 0.0)])
+def test_measured_a_constant_delay_is_known_by_the_parameter_alone(
+    site: Site, parameter_ms: float, off_m: float
+) -> None:
+    """At 5 m/s and 200 ms: by 190 ms of flight behind, or not at all."""
+    rig = Rig(site, speed=5.0, firmware=(4, 7, 0), filter=FilterOptions(stamps="jitter", viso_delay_ms=parameter_ms))
+    for _ in range(200):
+        rig.fly(0.1)
+        rig.see(rig.at[0] - 5.0 * 0.2, rig.at[1], sigma=0.3, age_s=0.2)
+    assert -rig.error[0] == pytest.approx(off_m, abs=0.08)

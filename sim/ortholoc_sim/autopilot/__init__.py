@@ -4,8 +4,8 @@
 It follows one of two firmwares: `ardupilot.ArduPilot` and `px4.Px4` transcribe what each makes of an external position,
 version by version, and say of each message what became of it (`VisionRecord`). A `Port` carries the messages.
 
-What is simplified is said in each module. In common: dead reckoning is integrated from accelerometers with what is left
-of their bias, not estimated by 24 states; height is the barometer's, drifting, whatever the source that is set for it.
+What is simplified is said in each module. In common: dead reckoning is integrated from accelerometers and an attitude
+that err, and corrected by an offset and a drift per axis, not by 24 states.
 """
 
 from ortholoc_sim.autopilot.ardupilot import position_sigma_m

@@ -2,8 +2,8 @@
 
 Simplified: one core that is always aligned; 24 states are an offset and a drift of dead reckoning per axis; a
 measurement is applied at its capture time at once instead of when a delayed horizon reaches it. EKF3 holds its position
-still once it has had no aiding for 15 s; this one goes on dead reckoning and says the same. VISO_ORIENT, a heading from
-vision (EK3_SRCn_YAW 6) and a height from it (EK3_SRCn_POSZ 6) are not simulated.
+still once it has had no aiding for 15 s; this one goes on dead reckoning and says the same. Height and heading of a
+source other than barometer and compass are weighed, not gated. VISO_ORIENT is not simulated.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import math
 
 import numpy as np
 
+from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_sim.autopilot.clocks import JitterCorrection, LeastRoundTrip
 from ortholoc_sim.autopilot.dialect import Message, dialect
@@ -25,8 +26,9 @@ from ortholoc_sim.autopilot.sensors import GnssSample
 from ortholoc_sim.site import Geopoint
 
 _MS, _S = 1_000_000, 1_000_000_000
-# EK3_SRCn_POSXY and VELXY.
+# EK3_SRCn_POSXY, VELXY, POSZ and YAW.
 _GNSS, _VISION = 3, 6
+_LEAST_YAW_SIGMA, _MOST_YAW_SIGMA = math.radians(5.0), 1.5
 _VISO_MAVLINK, _VISO_T265, _VISO_VOXL = 1, 2, 3
 _GPS_MAVLINK = 14
 _EXT_NAV_INTERVAL_NS = 20 * _MS
@@ -58,6 +60,14 @@ def position_sigma_m(covariance: list[float], firmware: Version) -> float:
         total = sum(c)
         return math.sqrt(max(total, 0.0)) if not math.isnan(total) else math.nan
     return float(np.cbrt(sum(v * v for v in c)))
+
+
+def yaw_sigma_rad(covariance: list[float], firmware: Version) -> float:
+    """The one standard deviation that it makes of the three angles; NaN where one is told none."""
+    c = [covariance[15], covariance[18], covariance[20]]
+    if math.isnan(covariance[0]):
+        return 0.0
+    return math.sqrt(max(sum(c), 0.0)) if firmware >= SQUARE_ROOT_SINCE else float(np.cbrt(sum(v * v for v in c)))
 
 
 class ArduPilot(Estimator):
@@ -110,6 +120,8 @@ class ArduPilot(Estimator):
                 self._frame.origin = self._frame.geopoint(gnss.position_ned_m)
                 self.texts.append((INFO, "EKF3 IMU0 origin set"))
             self._gnss(gnss.position_ned_m[:2], gnss.sigma_m, boot_ns, boot_ns)
+            if self._source("POSZ") == _GNSS:
+                self._fuse_height(float(gnss.position_ned_m[2]), 1.5 * gnss.sigma_m)
             if self._source("VELXY") == _GNSS:
                 sigma = max(gnss.sigma_m_s, self._parameters.active("EK3_VELNE_M_NSE"))
                 believed = self._dead_reckoned[:2] + self.filter.drift_m_s if self._dead_reckoned is not None else 0.0
@@ -181,7 +193,9 @@ class ArduPilot(Estimator):
             self._odometry(message, boot_ns)
         elif kind in ("VISION_POSITION_ESTIMATE", "GLOBAL_VISION_POSITION_ESTIMATE"):
             position = np.array([message.x, message.y, message.z])
-            self._vision(kind, message.usec, position, message.covariance, message.reset_counter, 0, boot_ns)
+            self._vision(
+                kind, message.usec, position, message.covariance, message.reset_counter, 0, boot_ns, message.yaw
+            )
         elif kind == "GLOBAL_POSITION_SENSOR":
             why = "no release of ArduPilot has a handler for it"
             self._record(kind, boot_ns, self._place(message.lat, message.lon), Verdict.UNHEARD, why)
@@ -216,7 +230,10 @@ class ArduPilot(Estimator):
             return
         if m.vx == 0.0 and m.vy == 0.0 and m.vz == 0.0:
             self.counts["zero_velocity"] += 1  # says that it stands still, where it means that it does not know
-        taken = self._vision("ODOMETRY", m.time_usec, position, m.pose_covariance, m.reset_counter, m.quality, boot_ns)
+        yaw = rotation.to_euler(rotation.from_quaternion(m.q))[2] if finite(*m.q) and any(m.q) else math.nan
+        taken = self._vision(
+            "ODOMETRY", m.time_usec, position, m.pose_covariance, m.reset_counter, m.quality, boot_ns, yaw
+        )
         velocity = np.array([m.vx, m.vy, m.vz])
         if taken and self._source("VELXY") == _VISION and np.isfinite(velocity).all():
             assert self._dead_reckoned is not None
@@ -249,7 +266,7 @@ class ArduPilot(Estimator):
 
     def _vision(
         self, message: str, stamp_us: int, public: FloatArray, covariance: list[float], counter: int, quality: int,
-        boot_ns: int,
+        boot_ns: int, yaw_rad: float,
     ) -> bool:  # fmt: skip
         """AP_VisualOdom and writeExtNavData. True if it came as far as the filter's buffer."""
         capture_ns = self._capture_ns(stamp_us, boot_ns)  # even what is not taken teaches the relation of the clocks
@@ -279,11 +296,26 @@ class ArduPilot(Estimator):
                     measured + self._shift_m, sigma, capture_ns, boot_ns, "vision", changed
                 )
                 why = "" if verdict is not Verdict.GATED else f"test ratio {self._test_ratio:.2f}"
+            arm = self._lever_arm("VISO_POS_X", "VISO_POS_Y", "VISO_POS_Z")
+            self._vision_besides(float(position[2] * scale - arm[2]), yaw_rad, covariance, sigma, capture_ns, boot_ns)
         self._record(
             message, boot_ns, position, verdict, why, capture_ns=capture_ns, sigma_m=sigma, counter=counter,
             innovation_m=innovation,
         )  # fmt: skip
         return refused is None
+
+    def _vision_besides(
+        self, down_m: float, yaw_rad: float, covariance: list[float], sigma_m: float, capture_ns: int, boot_ns: int
+    ) -> None:
+        """Height, with the sigma of the position, and heading, of a vision that was not refused."""
+        age_s = (boot_ns - capture_ns) / _S
+        if self._source("POSZ") == _VISION:
+            self._fuse_height(down_m, sigma_m, age_s)
+        if self._source("YAW") == _VISION:
+            sigma = yaw_sigma_rad(covariance, self.options.firmware)
+            sigma = _MOST_YAW_SIGMA / 2.0 if math.isnan(sigma) else sigma
+            least = max(self._parameters.active("VISO_YAW_M_NSE"), _LEAST_YAW_SIGMA)
+            self._fuse_heading(yaw_rad, min(max(sigma, least), _MOST_YAW_SIGMA), age_s)
 
     def _refusal(
         self, kind: int, quality: int, position: FloatArray, capture_ns: int, boot_ns: int

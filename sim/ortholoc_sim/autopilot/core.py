@@ -97,7 +97,6 @@ class AutopilotCore:
         self._true_m = site.autopilot_from_ned(truth.position_ned_m)
         self._truth = truth
         self._rates = truth.rates_body_rad_s
-        self._down_error_m = 0.0
         self._shadow: FloatArray | None = None
         self._shadow_drift = np.zeros(2)
         self._boot_ns = 0
@@ -106,6 +105,7 @@ class AutopilotCore:
         self.estimator.filter.reckoned_m = self._true_m[:2].copy()
         self.estimator.ned_from_body = truth.ned_from_body
         self.estimator.velocity_ned_m_s = truth.velocity_ned_m_s.copy()
+        self.estimator.down_m = float(self._true_m[2])
 
     def _start(self) -> None:
         """What begins anew when the autopilot does."""
@@ -191,7 +191,7 @@ class AutopilotCore:
     @property
     def position_ned_m(self) -> FloatArray:
         """(3,) its estimate, from the site's origin, by its own earth model."""
-        return np.append(self.filter.position_m, self._true_m[2] + self._down_error_m)
+        return np.append(self.filter.position_m, self.estimator.down_m)
 
     @property
     def velocity_ned_m_s(self) -> FloatArray:
@@ -244,8 +244,8 @@ class AutopilotCore:
         self._boot_ns = boot_ns = boot_ns - self._rebooted_ns
         self._truth = truth
         self._true_m = self._site.autopilot_from_ned(truth.position_ned_m)
-        readings = self.sensors.step(boot_ns, truth, self._true_m, dt_s)
-        self._rates, self._down_error_m = readings.rates_rad_s, readings.down_error_m
+        readings = self.sensors.step(boot_ns, truth, self._true_m, dt_s, self.estimator.heading_offset_rad)
+        self._rates = readings.rates_rad_s
         self.estimator.step(readings, boot_ns, dt_s)
         if self.gnss:
             self._shadow = None
@@ -270,7 +270,7 @@ class AutopilotCore:
         self.counts.update(before.counts)
         self.estimator.filter.reckoned_m = before.filter.position_m
         self.estimator.ned_from_body = before.ned_from_body
-        self.estimator.velocity_ned_m_s = before.velocity_ned_m_s
+        self.estimator.velocity_ned_m_s, self.estimator.down_m = before.velocity_ned_m_s, before.down_m
         self.sensors.gnss.restart()
         self.counts["reboots"] += 1
 

@@ -8,6 +8,7 @@ from collections import Counter
 
 import numpy as np
 
+from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_sim.autopilot.clocks import Timesync
 from ortholoc_sim.autopilot.dialect import Message, dialect
@@ -18,8 +19,33 @@ from ortholoc_sim.autopilot.position_filter import PositionFilter
 from ortholoc_sim.autopilot.records import Verdict, VisionRecord
 from ortholoc_sim.autopilot.sensors import GnssSample, Readings
 from ortholoc_sim.site import Geopoint
+from ortholoc_sim.vehicle import wrapped
 
 _MS, _S = 1_000_000, 1_000_000_000
+# Of the barometer, m, and of gyroscopes without a compass, rad, per root second.
+_HEIGHT_NOISE, _HEADING_NOISE = 0.05, 0.003
+
+
+class _Offset:
+    """What is added to a sensor of its own so that it agrees with another source; a filter of one state.
+
+    Attributes:
+        value: the offset. moved: by the last correction.
+    """
+
+    def __init__(self, noise: float) -> None:
+        """Args: of its drift, per root second."""
+        self._noise, self._variance = noise**2, 1.0
+        self.value = self.moved = 0.0
+
+    def predict(self, dt_s: float) -> None:
+        self._variance += self._noise * dt_s
+
+    def correct(self, difference: float, sigma: float) -> None:
+        gain = self._variance / (self._variance + sigma**2)
+        self.moved = gain * difference
+        self.value += self.moved
+        self._variance *= 1.0 - gain
 
 
 class Estimator(ABC):
@@ -31,7 +57,8 @@ class Estimator(ABC):
         counts: of what is worth counting besides.
         timesync: how it has the time of a stamp.
         has_gnss: whether the receiver has a fix.
-        velocity_ned_m_s: (3,) as believed. ned_from_body: likewise.
+        velocity_ned_m_s: (3,) as believed. ned_from_body, down_m: likewise.
+        heading_offset_rad: what it has added to the compass's heading; the owner gives it to the sensors.
         texts: what it says aloud (MAV_SEVERITY, text); the owner takes them.
     """
 
@@ -48,6 +75,10 @@ class Estimator(ABC):
         self.texts: list[tuple[int, str]] = []
         self.velocity_ned_m_s: FloatArray = np.zeros(3)
         self.ned_from_body: FloatArray = np.eye(3)
+        self.down_m = 0.0
+        self.heading_offset_rad = 0.0
+        self._height, self._heading = _Offset(_HEIGHT_NOISE), _Offset(_HEADING_NOISE)
+        self._yaw_rate = 0.0
         self._dead_reckoned: FloatArray | None = None
         self.has_gnss = False
         self.last_fused_ns: int | None = None
@@ -58,8 +89,14 @@ class Estimator(ABC):
         self._dead_reckoned = readings.velocity_ned_m_s
         self.filter.predict(boot_ns, 0.5 * (before + readings.velocity_ned_m_s)[:2] * dt_s, dt_s)
         self.ned_from_body = readings.ned_from_body
+        self._yaw_rate = float(readings.rates_rad_s[2])
+        self._height.predict(dt_s)
+        self._heading.predict(dt_s)
+        self.down_m = readings.down_m + self._height.value
         self.has_gnss = readings.has_fix
         self._aid(readings.gnss, boot_ns)
+        self.down_m = readings.down_m + self._height.value
+        self.heading_offset_rad = self._heading.value
         drift = self.filter.drift_m_s
         self.velocity_ned_m_s = readings.velocity_ned_m_s + np.array([drift[0], drift[1], 0.0])
 
@@ -88,6 +125,19 @@ class Estimator(ABC):
 
     def _fused_within(self, boot_ns: int, seconds: float) -> bool:
         return self.last_fused_ns is not None and boot_ns - self.last_fused_ns <= seconds * _S
+
+    def _fuse_height(self, down_m: float, sigma_m: float, age_s: float = 0.0) -> None:
+        """Of a source that is set for height instead of the barometer; not gated."""
+        if math.isfinite(down_m):
+            then = self.down_m - float(self.velocity_ned_m_s[2]) * age_s
+            self._height.correct(down_m - then, sigma_m)
+            self.down_m += self._height.moved
+
+    def _fuse_heading(self, yaw_rad: float, sigma_rad: float, age_s: float) -> None:
+        """Of a source that is set for heading instead of the compass; not gated."""
+        if math.isfinite(yaw_rad):
+            then = rotation.to_euler(self.ned_from_body)[2] - self._yaw_rate * age_s
+            self._heading.correct(wrapped(yaw_rad - then), sigma_rad)
 
     def _lever_arm(self, *names: str) -> FloatArray:
         """(3,) NED m, from the body's reference point to where the position was measured."""

@@ -4,15 +4,15 @@ Everything is fused when the delayed horizon, EKF2_DELAY_MAX ago, reaches it. Ex
 GNSS; beside it, its offset to the filter is estimated away. GNSS counts as used until it has been bad for 7 s.
 
 Simplified: one instance with heading aligned; 24 states are an offset and a drift of dead reckoning per axis; what is
-told is the filter's position carried to now, without the output predictor's smoothing of 0.25 s. Heading and height
-from vision (EKF2_EV_CTRL bits 3 and 1, EKF2_HGT_REF 3) are not simulated.
+told is the filter's position carried to now, without the output predictor's smoothing of 0.25 s. Height and heading of
+a source other than barometer and compass (EKF2_HGT_REF 1 and 3, EKF2_EV_CTRL bits 1 and 3) are weighed, not gated.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -43,6 +43,8 @@ _EV_RESETS = 5
 _EV_BIAS_NOISE = 0.13  # m/s per root Hz
 _FLT_EPSILON = 1.1920929e-07
 _EXTERNAL_SIGMA_M, _EXTERNAL_MOST_S = 50.0, 15.0
+# EKF2_HGT_REF.
+_HEIGHT_OF_GNSS, _HEIGHT_OF_VISION = 1, 3
 
 # Estimator types, by MAV_ESTIMATOR_TYPE: which are taken for visual odometry. 1 (naive) is, without its covariance.
 _VISUAL, _NAIVE = (0, 1, 2, 3), 1
@@ -69,7 +71,9 @@ class _Sample:
     quality: int = 0
     frame: int = dialect.MAV_FRAME_LOCAL_NED
     ned_from_body: FloatArray | None = None
+    down_variance: float = 0.0
     angle_variance: float = math.inf
+    yaw_variance: float = math.inf
     velocity_m_s: FloatArray | None = None
     velocity_in_body: bool = False
     velocity_sigma_m_s: float = 0.0
@@ -230,6 +234,9 @@ class Px4(Estimator):
             return
         if self._frame.origin is None:
             self._frame.origin = self._frame.geopoint(sample.position_m)
+        if control & 2 and self._parameters.active("EKF2_HGT_REF") == _HEIGHT_OF_GNSS:
+            age_s = (boot_ns - sample.time_ns) / _S
+            self._fuse_height(float(sample.position_m[2]), 1.5 * float(np.sqrt(sample.variance_m2[0])), age_s)
         found = self.filter.innovation(sample.position_m[:2], sample.time_ns, boot_ns)
         if found is None:
             return
@@ -285,6 +292,8 @@ class Px4(Estimator):
             may_start = False
         control = int(self._parameters.active("EKF2_EV_CTRL"))
         self._fuse_velocity(sample, "EKF2_EVV_NOISE", "EKF2_EVV_GATE", control & 4 != 0 and good)
+        if good:
+            self._vision_besides(sample, control, boot_ns)
         if control & 1:
             self._vision_position(sample, good, reset, may_start, boot_ns)
         else:
@@ -292,6 +301,19 @@ class Px4(Estimator):
             self._tell(sample, Verdict.DISABLED, f"EKF2_EV_CTRL is {control}, without bit 0")
         if good:
             self._ev_previous = sample
+
+    def _vision_besides(self, sample: _Sample, control: int, boot_ns: int) -> None:
+        """Height, where it is the reference, and heading."""
+        age_s = (boot_ns - sample.time_ns) / _S
+        if control & 2 and self._parameters.active("EKF2_HGT_REF") == _HEIGHT_OF_VISION:
+            arm = self._lever_arm("EKF2_EV_POS_X", "EKF2_EV_POS_Y", "EKF2_EV_POS_Z")
+            sigma = max(math.sqrt(sample.down_variance), self._parameters.active("EKF2_EVP_NOISE"))
+            down = float(self._frame.inner_from_public(sample.position_m)[2] - arm[2])
+            self._fuse_height(down, sigma, age_s)
+        if control & 8 and sample.ned_from_body is not None:
+            yaw = rotation.to_euler(sample.ned_from_body)[2]
+            sigma = max(math.sqrt(sample.yaw_variance), self._parameters.active("EKF2_EVA_NOISE"))
+            self._fuse_heading(yaw, sigma, age_s)
 
     def _vision_position(self, sample: _Sample, good: bool, reset: bool, may_start: bool, boot_ns: int) -> None:
         position, variance = self._in_ned(sample)
@@ -382,8 +404,9 @@ class Px4(Estimator):
         the two attitudes differ."""
         position, variance = sample.position_m, sample.variance_m2
         arm = self._lever_arm("EKF2_EV_POS_X", "EKF2_EV_POS_Y", "EKF2_EV_POS_Z")
-        if sample.frame == dialect.MAV_FRAME_LOCAL_FRD and sample.ned_from_body is not None:
-            turn = self.ned_from_body @ sample.ned_from_body.T
+        if sample.frame == dialect.MAV_FRAME_LOCAL_FRD:
+            attitude = np.eye(3) if sample.ned_from_body is None else sample.ned_from_body
+            turn = self.ned_from_body @ attitude.T
             position = turn @ position
             variance = np.maximum(turn[:2, :2] ** 2 @ variance, sample.angle_variance)
         return (self._frame.inner_from_public(position) - arm)[:2], variance
@@ -477,7 +500,7 @@ class Px4(Estimator):
 
     def _sample(
         self, message: str, stamp_us: int, boot_ns: int, position: tuple[float, float, float], c: list[float],
-        counter: int, quality: int, frame: int, attitude: FloatArray,
+        counter: int, quality: int, frame: int, attitude: FloatArray | None,
     ) -> _Sample:  # fmt: skip
         time_ns = self.timesync.correct_ns(stamp_us * 1000, boot_ns)
         time_ns -= round(self._parameters.active("EKF2_EV_DELAY") * _MS)
@@ -492,7 +515,10 @@ class Px4(Estimator):
         variance = np.array([v if told and math.isfinite(v) else 0.0 for v in (c[0], c[6])])
         angles = [v for v in (c[15], c[18], c[20]) if told and math.isfinite(v)]
         angle = max([self._parameters.active("EKF2_EVA_NOISE") ** 2, *angles])
-        return _Sample(message, time_ns, boot_ns, at, variance, counter, quality, frame, attitude, angle_variance=angle)
+        down, yaw = (c[n] if told and math.isfinite(c[n]) else 0.0 for n in (11, 20))
+        return _Sample(
+            message, time_ns, boot_ns, at, variance, counter, quality, frame, attitude, down, angle, yaw
+        )  # fmt: skip
 
     def _push_vision(self, sample: _Sample) -> None:
         if not np.isfinite(sample.position_m[:2]).all():
@@ -521,7 +547,7 @@ class Px4(Estimator):
         attitude = rotation.from_quaternion(m.q) if finite(*m.q) else None
         sample = self._sample(
             "ODOMETRY", m.time_usec, boot_ns, (m.x, m.y, m.z), covariance, m.reset_counter, m.quality, m.frame_id,
-            np.eye(3) if attitude is None else attitude,
+            attitude,
         )  # fmt: skip
         if finite(m.vx, m.vy, m.vz):
             in_body = m.child_frame_id in (
@@ -529,7 +555,7 @@ class Px4(Estimator):
             )  # fmt: skip
             if m.vx == 0.0 and m.vy == 0.0 and m.vz == 0.0:
                 self.counts["zero_velocity"] += 1
-            sample = _with_velocity(sample, np.array([m.vx, m.vy, m.vz]), in_body)
+            sample = replace(sample, velocity_m_s=np.array([m.vx, m.vy, m.vz]), velocity_in_body=in_body)
         self._push_vision(sample)
 
     def _global_position_sensor(self, m: Message, boot_ns: int) -> None:
@@ -601,10 +627,3 @@ class Px4(Estimator):
             pos_horiz_ratio=math.sqrt(max(ratios, default=0.0)), pos_vert_ratio=0.1, mag_ratio=0.1,
             hagl_ratio=0.0, tas_ratio=0.0, pos_horiz_accuracy=sigma, pos_vert_accuracy=1.0,
         )  # fmt: skip
-
-
-def _with_velocity(sample: _Sample, velocity_m_s: FloatArray, in_body: bool) -> _Sample:
-    return _Sample(
-        sample.message, sample.time_ns, sample.arrival_ns, sample.position_m, sample.variance_m2, sample.counter,
-        sample.quality, sample.frame, sample.ned_from_body, sample.angle_variance, velocity_m_s, in_body,
-    )  # fmt: skip

@@ -195,14 +195,14 @@ class Readings:
     Attributes:
         ned_from_body: attitude that it believes. rates_rad_s: (3,).
         velocity_ned_m_s: (3,) dead reckoned.
-        down_error_m: of its height.
+        down_m: by the barometer, in the autopilot's frame.
         gnss: a new sample, if there is one. has_fix: what the receiver says of itself.
     """
 
     ned_from_body: FloatArray
     rates_rad_s: FloatArray
     velocity_ned_m_s: FloatArray
-    down_error_m: float
+    down_m: float
     gnss: GnssSample | None
     has_fix: bool
 
@@ -233,12 +233,18 @@ class SensorSuite:
         self._velocity = truth.velocity_ned_m_s.copy()
         self._true_velocity = truth.velocity_ned_m_s.copy()
 
-    def step(self, now_ns: int, truth: Truth, true_ned_m: FloatArray, dt_s: float) -> Readings:
-        """``true_ned_m`` is the true position in the autopilot's own frame."""
+    def step(
+        self, now_ns: int, truth: Truth, true_ned_m: FloatArray, dt_s: float, heading_offset_rad: float = 0.0
+    ) -> Readings:
+        """
+        Args:
+            true_ned_m: (3,) the true position in the autopilot's own frame.
+            heading_offset_rad: what the autopilot has added to the compass's heading.
+        """
         o = self.options
         self._tilt = wander(self._tilt, np.deg2rad(o.tilt_deg), o.tilt_time_s, dt_s, self._rng.standard_normal(2))
         self._climb = wander(self._climb, o.climb_m_s, o.climb_time_s, dt_s, self._rng.standard_normal(1))
-        heading_error = self.compass.error_rad(dt_s)
+        heading_error = self.compass.error_rad(dt_s) + heading_offset_rad
         acceleration = (truth.velocity_ned_m_s - self._true_velocity) / dt_s
         self._true_velocity = truth.velocity_ned_m_s
         force = self.imu.specific_force(acceleration, truth.ned_from_body, dt_s)
@@ -250,7 +256,7 @@ class SensorSuite:
             ned_from_body=rotation.exp([*self._tilt, heading_error]) @ truth.ned_from_body,
             rates_rad_s=self.imu.rates(truth.rates_body_rad_s),
             velocity_ned_m_s=self._velocity,
-            down_error_m=self.barometer.error(dt_s),
+            down_m=float(true_ned_m[2]) + self.barometer.error(dt_s),
             gnss=self.gnss.step(now_ns, true_ned_m, truth.velocity_ned_m_s, dt_s),
             has_fix=self.gnss.works,
         )
