@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from autopilot_rig import BOOT, OUR_OFFSET, QUIET, Rig, S, truth
 from oracles.ardupilot import ArduPilot as ArduPilotOracle
+from oracles.ardupilot import JitterCorrection as OracleClock
 from oracles.px4 import Px4 as Px4Oracle
 from oracles.used import Dropped, Used
-from ortholoc_sim.autopilot import AutopilotCore, AutopilotOptions, FilterOptions, Verdict, dialect
+from ortholoc_sim.autopilot import AutopilotCore, AutopilotOptions, FilterOptions, PositionFilter, Verdict, dialect
+from ortholoc_sim.autopilot.clocks import JitterCorrection
 from ortholoc_sim.site import Geopoint, Site
 
 from ortholoc_edge.geometry import rotation
@@ -518,3 +520,40 @@ def test_measured_a_constant_delay_is_known_by_the_parameter_alone(
         rig.fly(0.1)
         rig.see(rig.at[0] - 5.0 * 0.2, rig.at[1], sigma=0.3, age_s=0.2)
     assert -rig.error[0] == pytest.approx(off_m, abs=0.08)
+
+
+def test_ardupilots_clock_is_that_of_the_oracle_over_hundreds_of_messages() -> None:
+    """The least delay is forgotten after a hundred; a late burst is cut to half a second."""
+    rng = random.Random(8)
+    ours, theirs = JitterCorrection(), OracleClock()
+    now_us = 5_000_000
+    for n in range(700):
+        now_us += rng.randint(5_000, 120_000)
+        least_us = 20_000 if n < 250 else 90_000
+        lag_us = rng.choice((least_us, least_us + 3_000, 700_000 if n % 50 == 0 and n < 200 else least_us + 40_000))
+        stamp_us = now_us - lag_us
+        assert ours.correct_ns(stamp_us * 1000, now_us * 1000) == theirs.correct_us(stamp_us, now_us) * 1000
+
+
+def test_the_filter_knows_how_far_off_it_is() -> None:
+    """Measurements a second old, a drift that walks as it is told: the error is what the variance says."""
+    rng = np.random.default_rng(11)
+    offset_noise, drift_noise, sigma, age = 0.05, 0.15, 0.3, 20
+    ratios = []
+    for _ in range(40):
+        position_filter = PositionFilter(offset_noise, drift_noise)
+        # What dead reckoning is off by, which the filter must find: its first guess has the variance it begins with.
+        offset, drift = rng.normal(0.0, 2.0, 2), rng.normal(0.0, 0.2, 2)
+        offsets = []
+        for step in range(400):
+            offset = offset + drift * 0.05 + offset_noise * math.sqrt(0.05) * rng.standard_normal(2)
+            drift = drift + drift_noise * math.sqrt(0.05) * rng.standard_normal(2)
+            offsets.append(offset)
+            position_filter.predict(step * S // 20, np.zeros(2), 0.05)
+            if step % 10 == 9 and step > age:
+                seen = offsets[step - age] + sigma * rng.standard_normal(2)
+                found = position_filter.innovation(seen, (step - age) * S // 20, step * S // 20)
+                assert found is not None
+                position_filter.correct(found, sigma**2)
+        ratios.append((position_filter.position_m - offset) ** 2 / position_filter.variance_m2)
+    assert 0.6 < np.mean(ratios) < 1.5
