@@ -50,6 +50,8 @@ from ortholoc_sim.vehicle import VehicleOptions
 _S = 1_000_000_000
 _HOME = Geopoint(48.8026, 11.0033, 382.7)
 _NEVER_S = 1e9
+# It may fly for days: the truth is remembered for as long as a position may be old, records for some hours.
+_KEEP_S, _KEEP_RECORDS = 20.0, 100_000
 _SPEED_M_S: dict[Airframe, float] = {"multirotor": 9.0, "fixed-wing": 18.0}
 _MOST_WAIT_S = 0.05
 
@@ -167,7 +169,7 @@ class SimulatedLink:
         speed_m_s = spec.speed_m_s if spec.speed_m_s is not None else _SPEED_M_S[spec.airframe]
         options = LoopOptions(
             route, speed_m_s, climb_m=0.0, gnss_until_s=_NEVER_S, gnss=spec.gnss, vehicle=spec.vehicle(),
-            autopilot=autopilot, seed=spec.seed, closed=closed,
+            autopilot=autopilot, seed=spec.seed, closed=closed, keep_s=_KEEP_S,
         )  # fmt: skip
         self._lock = threading.RLock()
         self._stop = threading.Event()
@@ -225,7 +227,7 @@ class SimulatedLink:
 
     @property
     def records(self) -> list[VisionRecord]:
-        """What became of each position that it was sent."""
+        """What became of each position that it was sent; of very many, of the last."""
         with self._lock:
             return list(self.loop.autopilot.vision)
 
@@ -269,7 +271,7 @@ class SimulatedLink:
             if self._failure is not None:
                 raise OrtholocError(f"simulated link: {self._failure}") from self._failure
             if time.monotonic() > deadline:
-                raise TimeoutError(f"did not happen within {timeout_s:g} s of simulated flight")
+                raise TimeoutError(f"did not happen within {timeout_s:g} s")
             self._stop.wait(0.01)
 
     # -- in the thread --------------------
@@ -312,6 +314,9 @@ class SimulatedLink:
     def _tell(self, now_ns: int) -> None:
         """What is new since the last call."""
         autopilot = self.loop.autopilot
+        if len(autopilot.vision) > 2 * _KEEP_RECORDS:
+            del autopilot.vision[:_KEEP_RECORDS]
+            self._told = max(0, self._told - _KEEP_RECORDS)
         if self._on_event is None:
             return
         while self._told < len(autopilot.vision):

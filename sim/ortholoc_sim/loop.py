@@ -6,6 +6,7 @@ The vehicle is steered by what the autopilot believes, never by the truth. No th
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from dataclasses import dataclass, field
 
@@ -34,6 +35,7 @@ class LoopOptions:
         gnss_until_s: after the start; then it is gone.
         gnss: what else happens to it.
         closed: whether the last waypoint leads to the first again, without an end.
+        keep_s: samples older than this may be forgotten; a flight without an end has to.
     """
 
     route_map_m: FloatArray
@@ -45,6 +47,7 @@ class LoopOptions:
     autopilot: AutopilotOptions = field(default_factory=AutopilotOptions)
     seed: int = 1
     closed: bool = False
+    keep_s: float = math.inf
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,7 +73,8 @@ class ClosedLoop:
 
     Attributes:
         autopilot: for its counts and records.
-        samples: every step so far. Appended by the owner's thread; others may read what is there.
+        samples: every step so far, but see `LoopOptions.keep_s`. Appended by the owner's thread; others may read what
+            is there.
     """
 
     def __init__(self, site: Site, options: LoopOptions, start_ns: int) -> None:
@@ -158,6 +162,10 @@ class ClosedLoop:
             Sample(self._now_ns, truth, autopilot.true_position_m, autopilot.position_ned_m, autopilot.dead_reckoned_m)
         )
         self._stamps.append(self._now_ns)
+        if self._stamps[0] < self._now_ns - 2.0 * self.options.keep_s * _S:
+            # Half at a time, so that it costs nothing per step.
+            old = bisect_right(self._stamps, self._now_ns - round(self.options.keep_s * _S))
+            del self.samples[:old], self._stamps[:old]
         return out
 
     def truth_at(self, stamp_ns: int) -> Truth | None:

@@ -180,6 +180,16 @@ def test_guidance_goes_round_a_closed_route_whose_legs_are_short() -> None:
     assert [np.hypot(*t.position_ned_m[:2]) for t in truths] == pytest.approx([150.0] * len(truths), abs=14.0)
 
 
+def test_a_flight_without_end_forgets(site: Site) -> None:
+    corners = np.array([[-100.0, 0.0], [100.0, 0.0], [0.0, 100.0]])
+    route = np.column_stack([corners + site.anchor_map_m[:2], np.full(3, site.anchor_map_m[2] + 100.0)])
+    loop = ClosedLoop(site, LoopOptions(route, closed=True, keep_s=0.5), S)
+    for n in range(1, 40):
+        loop.advance(S + n * S // 10)
+        assert len(loop.samples) <= 100
+    assert loop.truth_at(loop.now_ns - S // 4) is not None and loop.truth_at(S + S) is None
+
+
 # -- sensors -------------------------------------------------------------------
 
 
