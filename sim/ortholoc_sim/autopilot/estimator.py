@@ -21,7 +21,7 @@ from ortholoc_sim.autopilot.sensors import GnssSample, Readings
 from ortholoc_sim.site import Geopoint
 from ortholoc_sim.vehicle import wrapped
 
-_MS, _S = 1_000_000, 1_000_000_000
+_S = 1_000_000_000
 # Of the barometer, m, and of gyroscopes without a compass, rad, per root second.
 _HEIGHT_NOISE, _HEADING_NOISE = 0.05, 0.003
 

@@ -20,7 +20,7 @@ KNOWN: dict[Stack, tuple[tuple[int, int], tuple[int, int]]] = {"ardupilot": ((4,
 
 @dataclass(frozen=True, slots=True)
 class FilterOptions:
-    """The position filter. The first six are ArduPilot's parameters at boot and go into its table; a PX4 has its own.
+    """The position filter. What has the name of an ArduPilot parameter goes into its table; a PX4 has its own.
 
     Attributes:
         pos_m_nse: VISO_POS_M_NSE, the least sigma believed of a vision position, m.
