@@ -69,6 +69,12 @@ def test_a_position_parameter_is_obeyed_at_once_and_a_type_after_a_reboot(site: 
     assert rig.command(dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1, 0, 0, 0, 0, 20190226) == 0
     rig.fly(0.1)
     assert rig.see(rig.at[0], rig.at[1]) is Verdict.DISABLED
+    # It has yet to begin, and without GNSS does not know where it is.
+    rig.command(dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT)
+    assert rig.said("EKF_STATUS_REPORT")[-1].flags == 0x400
+    rig.fly(8.0)
+    rig.command(dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT)
+    assert rig.said("EKF_STATUS_REPORT")[-1].flags & 0x90 == 0x80
 
 
 def test_t265_and_voxl_take_a_reset_in_their_ways(site: Site) -> None:

@@ -85,7 +85,7 @@ class ArduPilot(Estimator):
         self.source_set = 1
         self._commanded = options.switching == "command"
         self._test_ratio = 0.0
-        self._aiding: str | None = "GPS" if options.origin == "gnss" else None
+        self._aiding: str | None = "GPS" if self._under_way else None
         self._counter: int | None = None
         self._last_stamp_ns: int | None = None
         self._heard_ns: int | None = None
@@ -127,11 +127,8 @@ class ArduPilot(Estimator):
                 believed = self._dead_reckoned[:2] + self.filter.drift_m_s if self._dead_reckoned is not None else 0.0
                 self.filter.correct_velocity(gnss.velocity_ned_m_s[:2] - believed, sigma**2)
         if self._aiding is not None and not self._fused_within(boot_ns, _STOPS_AIDING_S):
-            if self.last_fused_ns is None:
-                self.last_fused_ns = boot_ns  # counted from the first step on
-            else:
-                self._aiding = None
-                self.texts.append((INFO, "EKF3 IMU0 stopped aiding"))
+            self._aiding = None
+            self.texts.append((INFO, "EKF3 IMU0 stopped aiding"))
 
     def _gnss(
         self, position: FloatArray, sigma_m: float, capture_ns: int, boot_ns: int

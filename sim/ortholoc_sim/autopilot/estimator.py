@@ -82,6 +82,8 @@ class Estimator(ABC):
         self._dead_reckoned: FloatArray | None = None
         self.has_gnss = False
         self.last_fused_ns: int | None = None
+        # In the air for a while, it is in use; after a restart it has yet to begin.
+        self._under_way = frame.origin is not None
 
     def step(self, readings: Readings, boot_ns: int, dt_s: float) -> None:
         """Go on with the sensors, and fuse what is due."""
@@ -94,6 +96,8 @@ class Estimator(ABC):
         self._heading.predict(dt_s)
         self.down_m = readings.down_m + self._height.value
         self.has_gnss = readings.has_fix
+        if self.last_fused_ns is None and self._under_way:
+            self.last_fused_ns = boot_ns
         self._aid(readings.gnss, boot_ns)
         self.down_m = readings.down_m + self._height.value
         self.heading_offset_rad = self._heading.value

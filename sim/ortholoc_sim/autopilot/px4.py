@@ -169,7 +169,7 @@ class Px4(Estimator):
         self._gnss_buffer, self._ev_buffer = _Buffer(), _Buffer()
         self._slots = [_Slot() for _ in range(4)]
         self._bias = _Bias()
-        self._gnss_used = options.origin == "gnss"
+        self._gnss_used = self._under_way
         self._gnss_fault = False
         self._gnss_good_ns: int | None = None
         self._gnss_fused_ns: int | None = None
