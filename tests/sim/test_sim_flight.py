@@ -134,7 +134,7 @@ def test_px4_is_held_by_either_message_once_it_gave_gnss_up(site: Site, firmware
     late = [r for r in loop.autopilot.vision if r.arrival_ns > loop.boot_ns(START + 18 * S)]
     assert {r.message for r in late} == {carrier} and {str(r.verdict) for r in late} == {"fused"}
     assert errors_after(loop)[-1000:].max() < 2.0
-    assert protocol.fusion.state is Fusion.FUSED
+    assert protocol.monitor.report.state is Fusion.FUSED
 
 
 def test_px4_takes_no_stream_of_two_a_second(site: Site) -> None:
