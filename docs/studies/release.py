@@ -1,4 +1,4 @@
-"""Ways to send fixes to a simulated ArduPilot that stamps them as it does: how far off it is, how sure it believes it is.
+"""Ways to send fixes to simulated autopilots that stamp them as they do: how far off they are, how sure they believe they are.
 
     python docs/studies/release.py [--seconds 65] [--seeds 2]
 
@@ -10,6 +10,8 @@ docs/release.md come from here.
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
+
 import numpy as np
 from ortholoc_sim import demo_pack_path
 from ortholoc_sim.autopilot import AutopilotOptions, FilterOptions, dialect
@@ -19,6 +21,7 @@ from ortholoc_sim.loop import ClosedLoop, LoopOptions
 from ortholoc_edge.adapters.mavlink import LinkOptions
 from ortholoc_edge.adapters.mavlink.codec import FrameParser
 from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate
+from ortholoc_edge.adapters.mavlink.geodesy import Place
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol
 from ortholoc_edge.tiles.pack import Pack
 
@@ -27,12 +30,25 @@ _START = 5_000 * _S
 _NOISE_M = 0.8
 
 
-def fly(mode: str, latency_s: float, jitter_s: float, viso_ms: float, seconds: float, seed: int):
-    """(horizontal errors (N,), errors over the filter's own sigma (N,)) after GNSS was lost."""
-    site, route = site_and_route(Pack.open(demo_pack_path()), FlightOptions())
-    autopilot = AutopilotOptions(filter=FilterOptions(stamps="jitter", viso_delay_ms=viso_ms), seed=3 + seed)
+def ardupilot(viso_ms: float) -> AutopilotOptions:
+    return AutopilotOptions(filter=FilterOptions(stamps="jitter", viso_delay_ms=viso_ms))
+
+
+def px4(minor: int, **parameters: float) -> AutopilotOptions:
+    """Synchronised before the flight; its clock is PX4's own business."""
+    return AutopilotOptions(
+        stack="px4", firmware=(1, minor, 0), filter=FilterOptions(converged_after=0), parameters=parameters
+    )
+
+
+def fly(mode: str, latency_s: float, jitter_s: float, autopilot: AutopilotOptions, seconds: float, seed: int):
+    """(horizontal errors (N,), errors over the filter's own sigma (N,)) after GNSS was lost, of PX4 7 s later."""
+    autopilot = replace(autopilot, seed=3 + seed)
+    site, route = site_and_route(Pack.open(demo_pack_path()), FlightOptions(autopilot=autopilot))
+    held_ms = autopilot.filter.viso_delay_ms if autopilot.stack == "ardupilot" else 0.0
+    since_ns = 0 if autopilot.stack == "ardupilot" else 7 * _S
     loop = ClosedLoop(site, LoopOptions(route, seed=seed, autopilot=autopilot), _START)
-    protocol = LinkProtocol(LinkOptions(endpoint="udp:127.0.0.1:1", release=mode, fixed_latency_ms=viso_ms or 250.0))
+    protocol = LinkProtocol(LinkOptions(endpoint="udp:127.0.0.1:1", release=mode, fixed_latency_ms=held_ms or 250.0))
     ours, theirs = dialect.MAVLink(None, 1, 197), dialect.MAVLink(None, 1, 1)
     to_us, to_it = FrameParser(), FrameParser()
     rng = np.random.default_rng(seed)
@@ -50,7 +66,11 @@ def fly(mode: str, latency_s: float, jitter_s: float, viso_ms: float, seconds: f
         if truth is not None and tick % 25 == 0:
             position = site.autopilot_from_ned(truth.position_ned_m) + rng.normal(0.0, _NOISE_M, 3)
             covariance = np.diag([_NOISE_M**2] * 3 + [1e-4] * 3)
-            fix = VisionEstimate(now - _S // 50, position, truth.ned_from_body, covariance)
+            at = site.geopoint_from_autopilot(position)
+            fix = VisionEstimate(
+                now - _S // 50, position, truth.ned_from_body, covariance,
+                place=Place(at.lat_deg, at.lon_deg, at.height_amsl_m), origin=protocol.telemetry.origin,
+            )
             ready.append((now + round((latency_s + jitter_s * rng.random()) * _S), fix))
         while ready and ready[0][0] <= now:
             protocol.release.take(ready.pop(0)[1], now, protocol.state_at)
@@ -62,11 +82,11 @@ def fly(mode: str, latency_s: float, jitter_s: float, viso_ms: float, seconds: f
             for answer in loop.receive(to_it.feed(reply.pack(ours), now), now):
                 for message in to_us.feed(answer.pack(theirs), now):
                     protocol.on_message(message, now)
-        if now > loop.gnss_lost_ns and loop.samples:
+        if now > loop.gnss_lost_ns + since_ns and loop.samples:
             sample = loop.samples[-1]
             difference = (sample.estimate_m - sample.true_m)[:2]
             errors.append(float(np.hypot(*difference)))
-            ratios.append(float(difference @ difference) / 2.0 / float(loop.autopilot.filter.covariance[0, 0]))
+            ratios.append(float(difference @ difference) / 2.0 / float(loop.autopilot.filter.variance_m2.mean()))
     return np.array(errors), np.array(ratios)
 
 
@@ -75,19 +95,27 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=65.0)
     parser.add_argument("--seeds", type=int, default=2)
     args = parser.parse_args()
-    print("| mode | latency s | VISO_DELAY_MS | error median, p90, max m | NEES / 2 |\n|---|---|---|---|---|")
-    for mode, latency_s, jitter_s, viso_ms in (
-        ("fast-forward", 0.2, 0.1, 0.0),
-        ("fixed-latency", 0.12, 0.1, 250.0),
-        ("raw", 0.2, 0.1, 200.0),
-        ("fast-forward", 0.5, 0.2, 0.0),
-        ("raw", 0.5, 0.2, 250.0),
+    print("| autopilot | mode | latency s | parameters | error median, p90, max m | NEES / 2 |\n|---|---|---|---|---|---|")
+    for mode, latency_s, jitter_s, autopilot in (
+        ("fast-forward", 0.2, 0.1, ardupilot(0.0)),
+        ("fixed-latency", 0.12, 0.1, ardupilot(250.0)),
+        ("raw", 0.2, 0.1, ardupilot(200.0)),
+        ("fast-forward", 0.5, 0.2, ardupilot(0.0)),
+        ("raw", 0.5, 0.2, ardupilot(250.0)),
+        ("fast-forward", 0.2, 0.1, px4(16)),
+        ("raw", 0.1, 0.05, px4(16)),
+        ("fast-forward", 0.2, 0.1, px4(18)),
+        ("raw", 0.2, 0.1, px4(18, EKF2_AGP0_DELAY=250.0, EKF2_DELAY_MAX=400.0)),
     ):
-        flights = [fly(mode, latency_s, jitter_s, viso_ms, args.seconds, seed) for seed in range(1, args.seeds + 1)]
+        flights = [fly(mode, latency_s, jitter_s, autopilot, args.seconds, seed) for seed in range(1, args.seeds + 1)]
         errors, ratios = (np.concatenate(parts) for parts in zip(*flights, strict=True))
         spread = f"{np.median(errors):.2f}, {np.percentile(errors, 90):.2f}, {errors.max():.2f}"
         latency = f"{latency_s:g} to {latency_s + jitter_s:g}"
-        print(f"| {mode} | {latency} | {viso_ms:.0f} | {spread} | {ratios.mean():.2f} |", flush=True)
+        px = autopilot.stack == "px4"
+        told = autopilot.parameters if px else {"VISO_DELAY_MS": autopilot.filter.viso_delay_ms}
+        named = ", ".join(f"{name} {value:g}" for name, value in told.items())
+        who = f"{autopilot.stack} {autopilot.firmware[0]}.{autopilot.firmware[1]}"
+        print(f"| {who} | {mode} | {latency} | {named} | {spread} | {ratios.mean():.2f} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -469,7 +469,7 @@ def site_and_route(pack: Pack, options: FlightOptions) -> tuple[Site, FloatArray
         raise MapError(f"area pack {pack.path}: no heights under the route; choose another route")
     level = float(np.nanmedian(ground))
     centre = xy.mean(axis=0)
-    site = Site(pack.georeference, np.array([*centre, level]))
+    site = Site(pack.georeference, np.array([*centre, level]), options.autopilot.stack)
     return site, np.column_stack([xy, np.full(len(xy), level + options.height_agl_m)])
 
 

@@ -6,6 +6,7 @@ The vehicle is steered by what the autopilot believes, never by the truth. No th
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from dataclasses import dataclass, field
 
@@ -13,9 +14,11 @@ import numpy as np
 
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import FloatArray
-from ortholoc_sim.autopilot import AutopilotCore, AutopilotOptions, Message
+from ortholoc_sim.autopilot import Airframe, AutopilotCore, AutopilotOptions, Message
+from ortholoc_sim.fixed_wing import FixedWing, FixedWingOptions
+from ortholoc_sim.gnss import GnssEvent, gnss_at
 from ortholoc_sim.site import Site
-from ortholoc_sim.vehicle import Guidance, Truth, Vehicle, VehicleOptions, wrapped
+from ortholoc_sim.vehicle import Craft, Guidance, Truth, Vehicle, VehicleOptions, wrapped
 
 STEP_NS = 10_000_000
 _S = 1_000_000_000
@@ -27,17 +30,24 @@ class LoopOptions:
 
     Attributes:
         route_map_m: (N, 3) waypoints in map coordinates; the flight starts at the first, ``climb_m`` below.
-        speed_m_s: over ground.
+        speed_m_s: over ground; of a fixed wing as far as its airspeed allows.
+        vehicle: what flies: a multirotor or a fixed wing.
         gnss_until_s: after the start; then it is gone.
+        gnss: what else happens to it.
+        closed: whether the last waypoint leads to the first again, without an end.
+        keep_s: samples older than this may be forgotten; a flight without an end has to.
     """
 
     route_map_m: FloatArray
     speed_m_s: float = 9.0
     climb_m: float = 20.0
     gnss_until_s: float = 10.0
-    vehicle: VehicleOptions = field(default_factory=VehicleOptions)
+    gnss: tuple[GnssEvent, ...] = ()
+    vehicle: VehicleOptions | FixedWingOptions = field(default_factory=VehicleOptions)
     autopilot: AutopilotOptions = field(default_factory=AutopilotOptions)
     seed: int = 1
+    closed: bool = False
+    keep_s: float = math.inf
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +73,8 @@ class ClosedLoop:
 
     Attributes:
         autopilot: for its counts and records.
-        samples: every step so far. Appended by the owner's thread; others may read what is there.
+        samples: every step so far, but see `LoopOptions.keep_s`. Appended by the owner's thread; others may read what
+            is there.
     """
 
     def __init__(self, site: Site, options: LoopOptions, start_ns: int) -> None:
@@ -76,13 +87,31 @@ class ClosedLoop:
         ]
         start = site.ned_from_map(options.route_map_m[0]) + np.array([0.0, 0.0, options.climb_m])
         course = route[1] - route[0]
-        self._guidance = Guidance(np.array(route), options.speed_m_s)
-        self._vehicle = Vehicle(
-            options.vehicle, start, np.zeros(3), float(np.arctan2(course[1], course[0])), options.seed
-        )
-        self.autopilot = AutopilotCore(options.autopilot, site, self._vehicle.truth)
+        self._guidance = self._guide(np.array(route), options.closed)
+        heading = float(np.arctan2(course[1], course[0]))
+        self._vehicle: Craft
+        airframe: Airframe
+        if isinstance(options.vehicle, FixedWingOptions):
+            self._vehicle, airframe = FixedWing(options.vehicle, start, heading, options.seed), "fixed-wing"
+        else:
+            self._vehicle = Vehicle(options.vehicle, start, np.zeros(3), heading, options.seed)
+            airframe = "multirotor"
+        self.autopilot = AutopilotCore(options.autopilot, site, self._vehicle.truth, airframe)
+        self.autopilot.mission.set_route(np.array(route))
+        self._revision = self.autopilot.mission.revision
         self.samples: list[Sample] = []
         self._stamps: list[int] = []
+
+    def _guide(self, route: FloatArray, closed: bool = False) -> Guidance:
+        options = self.options
+        if not isinstance(options.vehicle, FixedWingOptions):
+            return Guidance(route, options.speed_m_s, closed=closed)
+        # It needs room to turn, and cannot hover at the end.
+        wing = options.vehicle
+        return Guidance(
+            route, options.speed_m_s, wing.max_climb_m_s, 2.0 * wing.airspeed_m_s, closed=closed,
+            loiter_radius_m=1.6 * wing.least_turn_radius_m,
+        )  # fmt: skip
 
     @property
     def now_ns(self) -> int:
@@ -98,6 +127,10 @@ class ClosedLoop:
         """The autopilot's clock at ``now_ns`` of the owner's."""
         return now_ns - self._start_ns + self.options.autopilot.boot_offset_ns
 
+    def owner_ns(self, boot_ns: int) -> int:
+        """The owner's clock at a time of the autopilot's."""
+        return boot_ns - self.boot_ns(self._start_ns) + self._start_ns + self.autopilot.rebooted_ns
+
     def receive(self, messages: list[Message], now_ns: int) -> list[Message]:
         """Hand over messages that arrived; returns the answers."""
         return [answer for message in messages for answer in self.autopilot.handle(message, self.boot_ns(now_ns))]
@@ -112,17 +145,27 @@ class ClosedLoop:
     def _step(self) -> list[Message]:
         dt = STEP_NS / _S
         autopilot, vehicle = self.autopilot, self._vehicle
+        if autopilot.mission.revision != self._revision:
+            self._revision = autopilot.mission.revision
+            self._guidance = self._guide(autopilot.route())
+        autopilot.mission.current = autopilot.mission.target(self._guidance.leg)
         velocity, heading = self._guidance.wanted(autopilot.position_ned_m)
         yaw = rotation.to_euler(autopilot.ned_from_body)[2]
         vehicle.step(dt, velocity - autopilot.velocity_ned_m_s, wrapped(heading - yaw))
         self._now_ns += STEP_NS
-        autopilot.gnss = self._now_ns < self.gnss_lost_ns
+        signal = gnss_at(self.options.gnss, (self._now_ns - self._start_ns) / _S)
+        autopilot.gnss = signal.available and self._now_ns < self.gnss_lost_ns
+        autopilot.gnss_offset_m, autopilot.gnss_noise = signal.offset_ned_m, signal.noise
         truth = vehicle.truth
         out = autopilot.step(self.boot_ns(self._now_ns), truth, dt)
         self.samples.append(
             Sample(self._now_ns, truth, autopilot.true_position_m, autopilot.position_ned_m, autopilot.dead_reckoned_m)
         )
         self._stamps.append(self._now_ns)
+        if self._stamps[0] < self._now_ns - 2.0 * self.options.keep_s * _S:
+            # Half at a time, so that it costs nothing per step.
+            old = bisect_right(self._stamps, self._now_ns - round(self.options.keep_s * _S))
+            del self.samples[:old], self._stamps[:old]
         return out
 
     def truth_at(self, stamp_ns: int) -> Truth | None:

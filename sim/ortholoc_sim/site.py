@@ -1,9 +1,9 @@
-"""Where the simulated vehicle's NED frame lies in the map and on Earth, and what ArduPilot makes of it.
+"""Where the simulated vehicle's NED frame lies in the map and on Earth, and what its autopilot makes of it.
 
 Three horizontal frames meet. The map has grid north and grid metres. The simulation's NED has true north and true
 metres; it is tied to the map at an anchor in the middle of the world, by convergence and scale there (over a
 kilometre both change by less than 0.1 mm per metre). The autopilot's local position comes from latitude and
-longitude by a spherical formula of its own, in which "metres" are up to 0.4 % off; written out here a second time,
+longitude by a spherical formula of its own, in which "metres" are up to 0.7 % off; written out here a second time,
 so that a mistake in the daemon's copy shows.
 """
 
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +24,11 @@ from ortholoc_edge.tiles.georeference import Georeference
 
 # AP_Common/Location.h: LATLON_TO_M, metres per 1e-7 degree.
 _LATLON_TO_M = 0.011131884502145034
+# lib/geo/geo.h: CONSTANTS_RADIUS_OF_EARTH.
+_PX4_RADIUS_M = 6371000.0
+
+# Whose formula it is: ArduPilot's is equirectangular, PX4's azimuthal equidistant, each on a sphere of its own.
+Earth = Literal["ardupilot", "px4"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +40,38 @@ class Geopoint:
     height_amsl_m: float
 
 
+def local_from_geopoint(earth: Earth, origin: Geopoint, point: Geopoint) -> FloatArray:
+    """North, east, down (3,) in an autopilot's own metres; down is the difference of the heights."""
+    down = origin.height_amsl_m - point.height_amsl_m
+    if earth == "ardupilot":  # Location::get_distance_NE
+        dlat, dlon = (point.lat_deg - origin.lat_deg) * 1e7, (point.lon_deg - origin.lon_deg) * 1e7
+        scale = math.cos(math.radians((point.lat_deg + origin.lat_deg) / 2.0))
+        return np.array([dlat * _LATLON_TO_M, dlon * _LATLON_TO_M * scale, down])
+    lat0, lat = math.radians(origin.lat_deg), math.radians(point.lat_deg)
+    dlon = math.radians(point.lon_deg - origin.lon_deg)
+    half = math.sin((lat - lat0) / 2.0) ** 2 + math.cos(lat0) * math.cos(lat) * math.sin(dlon / 2.0) ** 2
+    distance_m = 2.0 * math.asin(math.sqrt(half)) * _PX4_RADIUS_M
+    bearing = math.atan2(
+        math.sin(dlon) * math.cos(lat), math.cos(lat0) * math.sin(lat) - math.sin(lat0) * math.cos(lat) * math.cos(dlon)
+    )
+    return np.array([distance_m * math.cos(bearing), distance_m * math.sin(bearing), down])
+
+
+def geopoint_from_local(earth: Earth, origin: Geopoint, position_ned_m: FloatArray) -> Geopoint:
+    """Inverse of :func:`local_from_geopoint`."""
+    north, east, down = (float(v) for v in position_ned_m)
+    height = origin.height_amsl_m - down
+    if earth == "ardupilot":  # Location::offset
+        lat = origin.lat_deg + north / _LATLON_TO_M * 1e-7
+        scale = math.cos(math.radians((lat + origin.lat_deg) / 2.0))
+        return Geopoint(lat, origin.lon_deg + east / _LATLON_TO_M / scale * 1e-7, height)
+    angle, bearing = math.hypot(north, east) / _PX4_RADIUS_M, math.atan2(east, north)
+    lat0 = math.radians(origin.lat_deg)
+    sine = math.sin(lat0) * math.cos(angle) + math.cos(lat0) * math.sin(angle) * math.cos(bearing)
+    dlon = math.atan2(math.sin(bearing) * math.sin(angle) * math.cos(lat0), math.cos(angle) - math.sin(lat0) * sine)
+    return Geopoint(math.degrees(math.asin(sine)), origin.lon_deg + math.degrees(dlon), height)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Site:
     """The frames around an anchor.
@@ -41,10 +79,12 @@ class Site:
     Attributes:
         georeference: of the map.
         anchor_map_m: (3,) easting, northing, height where NED is zero.
+        earth: the autopilot's formula.
     """
 
     georeference: Georeference
     anchor_map_m: FloatArray
+    earth: Earth = "ardupilot"
     _turn: FloatArray = field(init=False)
     grid_scale: float = field(init=False)
     origin: Geopoint = field(init=False)
@@ -86,26 +126,19 @@ class Site:
         return Geopoint(place.lat_deg, place.lon_deg, place.height_amsl_m)
 
     def autopilot_from_ned(self, position_ned_m: FloatArray) -> FloatArray:
-        """NED (3,) as ArduPilot would have it for the vehicle at an NED position of the simulation."""
+        """NED (3,) as the autopilot would have it for the vehicle at an NED position of the simulation."""
         return self.autopilot_from_geopoint(self.geopoint(position_ned_m))
 
     def autopilot_from_geopoint(self, point: Geopoint) -> FloatArray:
-        """``Location::get_distance_NE`` from the origin, and the difference of the heights."""
-        dlat, dlon = (point.lat_deg - self.origin.lat_deg) * 1e7, (point.lon_deg - self.origin.lon_deg) * 1e7
-        scale = math.cos(math.radians((point.lat_deg + self.origin.lat_deg) / 2.0))
-        return np.array(
-            [dlat * _LATLON_TO_M, dlon * _LATLON_TO_M * scale, self.origin.height_amsl_m - point.height_amsl_m]
-        )
+        """NED (3,) from the origin, by the autopilot's formula."""
+        return local_from_geopoint(self.earth, self.origin, point)
 
     def geopoint_from_autopilot(self, position_ned_m: FloatArray) -> Geopoint:
-        """Inverse of :meth:`autopilot_from_geopoint`: ``Location::offset``."""
-        north, east, down = (float(v) for v in position_ned_m)
-        lat = self.origin.lat_deg + north / _LATLON_TO_M * 1e-7
-        scale = math.cos(math.radians((lat + self.origin.lat_deg) / 2.0))
-        return Geopoint(lat, self.origin.lon_deg + east / _LATLON_TO_M / scale * 1e-7, self.origin.height_amsl_m - down)
+        """Inverse of :meth:`autopilot_from_geopoint`."""
+        return geopoint_from_local(self.earth, self.origin, position_ned_m)
 
     def ned_from_autopilot(self, position_ned_m: FloatArray) -> FloatArray:
-        """True NED (3,) of the simulation for ArduPilot's."""
+        """True NED (3,) of the simulation for the autopilot's."""
         point = self.geopoint_from_autopilot(position_ned_m)
         return self.ned_from_map(
             self.georeference.map_from_geodetic(point.lat_deg, point.lon_deg, height_amsl_m=point.height_amsl_m)

@@ -2,7 +2,8 @@
 
 ``forward URL URL``: a ground station between two connections, that passes each what comes over the other, until its
 stdin ends. ``addressee SYSTEM``: it is that system's autopilot and decodes the frames, hexadecimal, one a line, that it
-gets on stdin.
+gets on stdin. ``companion URL PARAMETER``: it is the companion of an autopilot: reads its version, its mission and a
+parameter, sets that to 2, uploads the mission without its last item, and sends a vision position at each line of stdin.
 """
 
 from __future__ import annotations
@@ -19,6 +20,9 @@ from mavsdk.enums import ForwardingOption
 from mavsdk.mavsdk import Configuration, Mavsdk
 from mavsdk.plugins.info import Info, InfoError, InfoResult
 from mavsdk.plugins.mavlink_direct import MavlinkDirect
+from mavsdk.plugins.mission_raw import MissionRaw
+from mavsdk.plugins.mocap import AngleBody, Covariance, Mocap, PositionBody, VisionPositionEstimate
+from mavsdk.plugins.param import Param
 from mavsdk.plugins.telemetry import Telemetry
 
 OURS = 197
@@ -105,11 +109,48 @@ def addressee(system_id: int) -> None:
     mavsdk.destroy()
 
 
+def companion(url: str, parameter: str) -> None:
+    mavsdk = Mavsdk(Configuration.create_with_component_type(ComponentType.COMPANION_COMPUTER))
+    check(mavsdk.add_any_connection(url))
+    system = mavsdk.first_autopilot(20.0)
+    if system is None:
+        raise SystemExit("MAVSDK found no autopilot")
+    telemetry, missions, parameters = Telemetry(system), MissionRaw(system), Param(system)
+    telemetry.subscribe_flight_mode(lambda mode, _: tell("mode", name=mode.name))
+    telemetry.subscribe_position(lambda at, _: tell("position", lat_deg=at.latitude_deg, lon_deg=at.longitude_deg))
+    version = firmware(Info(system))
+    items = missions.download_mission()
+    before = parameters.get_param_int(parameter)
+    parameters.set_param_int(parameter, 2)
+    names = parameters.get_all_params()
+    missions.upload_mission(items[:-1])
+    tell(
+        "vehicle",
+        firmware=[version.flight_sw_major, version.flight_sw_minor, version.flight_sw_patch],
+        autopilot=system.autopilot_type().name,
+        items=[len(items), len(missions.download_mission())],
+        parameter=[before, parameters.get_param_int(parameter)],
+        parameters=len(names.int_params) + len(names.float_params),
+    )
+    mocap = Mocap(system)
+    for line in sys.stdin:
+        x, y, z = (float(part) for part in line.split())
+        sigma = [0.25 if n in (0, 6, 11, 15, 18, 20) else 0.0 for n in range(21)]
+        mocap.set_vision_position_estimate(
+            VisionPositionEstimate(
+                time.monotonic_ns() // 1000, PositionBody(x, y, z), AngleBody(0.0, 0.0, 0.0), Covariance(sigma), 0
+            )
+        )
+    mavsdk.destroy()
+
+
 if __name__ == "__main__":
     match sys.argv[1:]:
         case ["forward", *urls]:
             forward(urls)
         case ["addressee", number]:
             addressee(int(number))
+        case ["companion", url, parameter]:
+            companion(url, parameter)
         case other:
             raise SystemExit(f"{other} is not understood; see the docstring")

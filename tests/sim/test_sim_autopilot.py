@@ -9,18 +9,16 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from autopilot_rig import BOOT, Rig, S, truth
 from ortholoc_sim.autopilot import (
     AutopilotCore,
     AutopilotOptions,
     FilterOptions,
-    Message,
-    SensorOptions,
     UdpPort,
     Verdict,
     position_sigma_m,
 )
 from ortholoc_sim.site import Geopoint, Site
-from ortholoc_sim.vehicle import Truth
 
 os.environ["MAVLINK20"] = "1"
 
@@ -32,68 +30,6 @@ from ortholoc_edge.adapters.mavlink.audit import Level, Situation, audit, parame
 from ortholoc_edge.adapters.mavlink.estimates import Autopilot
 from ortholoc_edge.adapters.mavlink.parameters import ParameterClient
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol
-
-S = 1_000_000_000
-BOOT = 1000 * S
-OUR_OFFSET = 7_000 * S + 12_345  # the companion's clock minus boot time
-QUIET = SensorOptions(
-    tilt_deg=0.0, yaw_bias_deg=0.0, yaw_deg=0.0, velocity_scale=0.0, velocity_turn_deg=0.0, velocity_walk=0.0,
-    acceleration_bias=0.0, climb_m_s=0.0, gnss_m=1e-6, baro_walk_m=0.0,
-)  # fmt: skip
-
-
-def truth(north: float = 0.0, east: float = 0.0, speed_north: float = 0.0) -> Truth:
-    return Truth(np.array([north, east, -90.0]), np.array([speed_north, 0.0, 0.0]), np.eye(3), np.zeros(3))
-
-
-class Rig:
-    """A core flown by hand: 10 ms steps, the vehicle north at a constant speed, GNSS gone after half a second."""
-
-    def __init__(self, site: Site, speed: float = 0.0, **options: object) -> None:
-        self.site, self.speed = site, speed
-        self.now, self.north = BOOT, 0.0
-        self.core = AutopilotCore(AutopilotOptions(sensors=QUIET, **options), site, truth())  # type: ignore[arg-type]
-        self.sent: list[Message] = []
-        self.fly(0.5)
-        self.core.gnss = False
-        self.fly(0.1)
-
-    def fly(self, seconds: float) -> None:
-        for _ in range(round(seconds * 100)):
-            self.now += S // 100
-            self.north += self.speed * 0.01
-            for message in self.core.step(self.now, truth(self.north, 0.0, self.speed), 0.01):
-                self.sent.append(message)
-                if message.get_type() == "TIMESYNC" and message.tc1 == 0:
-                    answer = dialect.MAVLink_timesync_message(tc1=self.now + OUR_OFFSET, ts1=message.ts1)
-                    self.core.handle(answer, self.now)
-
-    def see(self, north: float, east: float, sigma: float = 0.5, age_s: float = 0.0, **changes: object) -> Verdict:
-        """Send an ODOMETRY with one sigma in the new layout; says what became of it."""
-        covariance = [0.0] * 21
-        covariance[0] = covariance[6] = sigma**2 / 2
-        covariance[20] = 0.01
-        fields: dict[str, object] = {
-            "time_usec": (self.now + OUR_OFFSET - round(age_s * S)) // 1000,
-            "frame_id": dialect.MAV_FRAME_LOCAL_FRD,
-            "child_frame_id": dialect.MAV_FRAME_BODY_FRD,
-            "x": north, "y": east, "z": -90.0, "q": [1.0, 0.0, 0.0, 0.0],
-            "vx": math.nan, "vy": math.nan, "vz": math.nan,
-            "rollspeed": 0.0, "pitchspeed": 0.0, "yawspeed": 0.0,
-            "pose_covariance": covariance, "velocity_covariance": [math.nan] * 21,
-            "reset_counter": 0, "estimator_type": dialect.MAV_ESTIMATOR_TYPE_VISION, "quality": 80,
-        }  # fmt: skip
-        fields.update(changes)
-        self.core.handle(dialect.MAVLink_odometry_message(**fields), self.now)
-        return self.core.vision[-1].verdict
-
-    @property
-    def error(self) -> np.ndarray:
-        return (self.core.position_ned_m - self.core.true_position_m)[:2]
-
-    @property
-    def at(self) -> np.ndarray:
-        return self.core.true_position_m
 
 
 @pytest.fixture
@@ -128,6 +64,7 @@ def test_failed_quality_and_nan_are_dropped(rig: Rig) -> None:
 def test_gnss_comes_first(site: Site) -> None:
     rig = Rig(site)
     rig.core.gnss = True
+    rig.fly(0.02)  # a receiver tells it before anybody switches
     assert rig.see(5.0, 0.0) is Verdict.STANDBY
 
 
@@ -214,10 +151,11 @@ def test_sigma_is_floored_and_rate_limited(rig: Rig) -> None:
 
 
 def test_dead_reckoning_drifts_without_help(site: Site) -> None:
+    """A milliradian of tilt leaks a thousandth of gravity: half of that times the square of the time."""
     rig = Rig(site, speed=9.0)
-    rig.core._distortion = np.eye(2) * 1.02
+    rig.core.sensors.leaning_rad[:] = (0.0, 0.001)
     rig.fly(50.0)
-    assert rig.error[0] == pytest.approx(9.0, abs=1.0)
+    assert rig.error[0] == pytest.approx(-0.5 * 9.80665e-3 * 50.0**2, abs=1.0)
     assert rig.core.dead_reckoned_m is not None
 
 
@@ -281,7 +219,7 @@ def test_velocity_is_not_the_truth_itself(site: Site) -> None:
 def test_receiver_tells_its_own_position(site: Site) -> None:
     """Of the receiver, with its error, wherever the filter believes itself to be."""
     core = AutopilotCore(AutopilotOptions(streams_by_default=True), site, truth())
-    core.filter.offset_m += 300.0
+    core.filter.offset_m = core.filter.offset_m + 300.0
     sent = core.step(BOOT, truth(), 0.01)
     raw = next(m for m in sent if m.get_type() == "GPS_RAW_INT")
     point = Geopoint(raw.lat / 1e7, raw.lon / 1e7, raw.alt / 1e3)

@@ -22,6 +22,7 @@ from ortholoc_edge.adapters.camera import EndOfFrames
 from ortholoc_edge.adapters.mavlink import GimbalSelection, LinkOptions
 from ortholoc_edge.adapters.mavlink.codec import FrameParser
 from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate
+from ortholoc_edge.adapters.mavlink.geodesy import Place
 from ortholoc_edge.adapters.mavlink.monitor import Fusion
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol
 from ortholoc_edge.geometry import rotation
@@ -41,13 +42,13 @@ def route(site: Site) -> FloatArray:
 
 def flown(
     site: Site, seconds: float, *, estimates: bool, seed: int = 1, noise_m: float = 0.8, latency_s: float = 0.4,
-    release: str = "raw", position_filter: FilterOptions | None = None,
+    release: str = "raw", position_filter: FilterOptions | None = None, autopilot: AutopilotOptions | None = None,
 ) -> tuple[ClosedLoop, LinkProtocol]:  # fmt: skip
     """Fly faster than real time against the daemon's own protocol, every message packed and parsed.
 
     Fixes are the truth ``latency_s`` ago with noise, at 2 Hz.
     """
-    autopilot = AutopilotOptions(filter=position_filter or FilterOptions())
+    autopilot = autopilot or AutopilotOptions(filter=position_filter or FilterOptions())
     loop = ClosedLoop(site, LoopOptions(route(site), seed=seed, autopilot=autopilot), START)
     protocol = LinkProtocol(LinkOptions(endpoint="udp:127.0.0.1:1", release=release))
     ours, theirs = dialect.MAVLink(None, 1, 197), dialect.MAVLink(None, 1, 1)
@@ -66,7 +67,11 @@ def flown(
         truth = loop.truth_at(taken)
         if estimates and tick % 25 == 0 and truth is not None:
             position = site.autopilot_from_ned(truth.position_ned_m) + rng.normal(0.0, noise_m, 3)
-            fix = VisionEstimate(taken, position, truth.ned_from_body, np.diag([noise_m**2] * 3 + [1e-4] * 3))
+            at = site.geopoint_from_autopilot(position)
+            fix = VisionEstimate(
+                taken, position, truth.ned_from_body, np.diag([noise_m**2] * 3 + [1e-4] * 3),
+                place=Place(at.lat_deg, at.lon_deg, at.height_amsl_m), origin=protocol.telemetry.origin,
+            )  # fmt: skip
             protocol.release.take(fix, now, protocol.state_at)
         outgoing = protocol.release.due(now, protocol.state_at)
         if outgoing is not None:
@@ -118,6 +123,25 @@ def test_as_ardupilot_stamps_only_fast_forward_holds_it(site: Site) -> None:
     assert protocol.monitor.report.state is Fusion.FUSED
     advice = protocol.delay_advice()
     assert advice is not None and advice.viso_delay_ms == 0
+
+
+@pytest.mark.parametrize(("firmware", "carrier"), [((1, 16, 0), "ODOMETRY"), ((1, 18, 0), "GLOBAL_POSITION_SENSOR")])
+def test_px4_is_held_by_either_message_once_it_gave_gnss_up(site: Site, firmware: tuple, carrier: str) -> None:
+    """Lost at 10 s, given up 7 s later; ODOMETRY is relative until then."""
+    there = replace(site, earth="px4")
+    options = AutopilotOptions(stack="px4", firmware=firmware, filter=FilterOptions(converged_after=0))
+    loop, protocol = flown(there, 32.0, estimates=True, release="fast-forward", autopilot=options)
+    late = [r for r in loop.autopilot.vision if r.arrival_ns > loop.boot_ns(START + 18 * S)]
+    assert {r.message for r in late} == {carrier} and {str(r.verdict) for r in late} == {"fused"}
+    assert errors_after(loop)[-1000:].max() < 2.0
+    assert protocol.monitor.report.state is Fusion.FUSED
+
+
+def test_px4_takes_no_stream_of_two_a_second(site: Site) -> None:
+    """It wants two less than 200 ms apart to start: fixes sent once each never count."""
+    options = AutopilotOptions(stack="px4", firmware=(1, 16, 0), filter=FilterOptions(converged_after=0))
+    loop, _ = flown(replace(site, earth="px4"), 14.0, estimates=True, latency_s=0.1, autopilot=options)
+    assert {str(record.verdict) for record in loop.autopilot.vision} == {"waiting"}
 
 
 def test_the_monitor_tells_standby_from_fused(site: Site) -> None:
