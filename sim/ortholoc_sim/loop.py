@@ -11,6 +11,7 @@ from bisect import bisect_right
 from dataclasses import dataclass, field
 
 import numpy as np
+import rasterio
 
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import FloatArray
@@ -138,8 +139,10 @@ class ClosedLoop:
     def advance(self, now_ns: int) -> list[Message]:
         """Fly until ``now_ns`` in whole steps; returns what the autopilot sends."""
         out: list[Message] = []
-        while self._now_ns + STEP_NS <= now_ns:
-            out += self._step()
+        # Each step asks PROJ where it is; without an environment of rasterio's around it, that is set up each time.
+        with rasterio.Env():
+            while self._now_ns + STEP_NS <= now_ns:
+                out += self._step()
         return out
 
     def _step(self) -> list[Message]:
