@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import logging
 import math
-import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +32,7 @@ from ortholoc_sim.autopilot import AutopilotOptions, Message, SensorOptions
 from ortholoc_sim.line import End, Line, LineTransport
 from ortholoc_sim.loop import STEP_NS, ClosedLoop, LoopOptions
 from ortholoc_sim.scenario import Fault, FaultKind, LatencyTable, Scenario
+from ortholoc_sim.site import Site
 from ortholoc_sim.stage import Studio, make_grounds, pack_for
 from ortholoc_sim.vehicle import Truth, VehicleOptions
 
@@ -47,7 +47,7 @@ _NEVER_S = 1_000_000.0
 # A frame that is refused before anything is matched.
 _REFUSED_MS = 3.0
 # The flight ends so long after the route, at the speed that was asked for.
-_LEEWAY = 1.04
+_LEEWAY = 1.2
 _ARRIVED_M = 15.0
 # z of the 99th percentile of a normal distribution.
 _P99 = 2.3263
@@ -82,6 +82,7 @@ class Flown:
     Attributes:
         scenario, seed: that were flown.
         loop: for its samples and the autopilot's records.
+        site: its frames.
         route_map_m: (N, 3) waypoints.
         pack: of the daemon.
         frames: in the order of their outcomes.
@@ -94,6 +95,7 @@ class Flown:
     scenario: Scenario
     seed: int
     loop: ClosedLoop
+    site: Site
     route_map_m: FloatArray
     pack: Path
     frames: tuple[FlownFrame, ...]
@@ -282,7 +284,7 @@ class _Flight:
         table = scenario.route
         self._until_arrival = table.duration_s is None
         # Where it never gets to the end of its route, it is not waited for.
-        self.duration_s = table.duration_s or _LEEWAY * length_m / table.speed_m_s + 12.0
+        self.duration_s = table.duration_s or _LEEWAY * length_m / table.speed_m_s + 20.0
         self._line = Line(scenario.line, seed)
         self._transport = LineTransport(self._line, self._clock)
         self._loop = ClosedLoop(self._grounds.site, self._loop_options(), START_NS)
@@ -325,12 +327,12 @@ class _Flight:
                 daemon.report_status()
                 daemon.link.exchange(self._transport)
                 progress((now_ns - START_NS) / _S)
-            statistics_ = daemon.statistics()
+            statistics = daemon.statistics()
         finally:
             daemon.close()
         return Flown(
-            self.scenario, self.seed, self._loop, self._route, self._pack, tuple(worker.done), camera.exposed,
-            worker.replaced, tuple(self._said), dict(self._line.counts), statistics_, time.monotonic() - began,
+            self.scenario, self.seed, self._loop, self._grounds.site, self._route, self._pack, tuple(worker.done),
+            camera.exposed, worker.replaced, tuple(self._said), dict(self._line.counts), statistics, time.monotonic() - began,
         )  # fmt: skip
 
     def _arrived(self) -> bool:
