@@ -31,6 +31,7 @@ from ortholoc_edge.pipeline.outcome import Fix, Outcome
 from ortholoc_sim.autopilot import AutopilotOptions, Message, SensorOptions
 from ortholoc_sim.line import End, Line, LineTransport
 from ortholoc_sim.loop import STEP_NS, ClosedLoop, LoopOptions
+from ortholoc_sim.rounded import rounded
 from ortholoc_sim.scenario import Fault, FaultKind, LatencyTable, Scenario
 from ortholoc_sim.site import Site
 from ortholoc_sim.stage import Studio, make_grounds, pack_for
@@ -336,13 +337,12 @@ class _Flight:
         )  # fmt: skip
 
     def _arrived(self) -> bool:
-        if not self._until_arrival or not self._loop.samples:
+        if not self._until_arrival or not self._loop.on_last_leg:
             return False
-        here = self._grounds.site.map_from_ned(self._loop.samples[-1].truth.position_ned_m)
-        believed = self._loop.samples[-1]
-        off = believed.estimate_m - believed.true_m
         # By what it believes: a vehicle that is lost ends where it thinks that the route ends.
-        return float(np.hypot(*(here + (off[1], off[0], 0.0) - self._route[-1])[:2])) < _ARRIVED_M
+        site = self._grounds.site
+        believed = site.map_from_ned(site.ned_from_autopilot(self._loop.samples[-1].estimate_m))
+        return float(np.hypot(*(believed - self._route[-1])[:2])) < _ARRIVED_M
 
     def _carry(self, daemon: Daemon, until_ns: int) -> None:
         """Let what is on the line arrive, each frame at its time."""
@@ -387,8 +387,9 @@ class _Flight:
     # -- what it is made of ----------
 
     def _route_map(self) -> FloatArray:
-        xy = np.array(self.scenario.route.waypoints_m) + self._grounds.low_m
-        return np.column_stack([xy, np.full(len(xy), self._grounds.ground_m + self.scenario.route.height_agl_m)])
+        table = self.scenario.route
+        xy = rounded(np.array(table.waypoints_m), table.corner_radius_m) + self._grounds.low_m
+        return np.column_stack([xy, np.full(len(xy), self._grounds.ground_m + table.height_agl_m)])
 
     def _loop_options(self) -> LoopOptions:
         scenario = self.scenario

@@ -120,6 +120,11 @@ class ClosedLoop:
         return self._now_ns
 
     @property
+    def on_last_leg(self) -> bool:
+        """Whether the guidance flies to the last waypoint."""
+        return self._guidance.leg >= len(self._guidance.waypoints_ned_m) - 2
+
+    @property
     def gnss_lost_ns(self) -> int:
         """When GNSS goes, the owner's clock."""
         return self._start_ns + round(self.options.gnss_until_s * _S)
@@ -158,7 +163,7 @@ class ClosedLoop:
         self._now_ns += STEP_NS
         signal = gnss_at(self.options.gnss, (self._now_ns - self._start_ns) / _S)
         autopilot.gnss = signal.available and self._now_ns < self.gnss_lost_ns
-        autopilot.gnss_offset_m, autopilot.gnss_noise = signal.offset_ned_m, signal.noise
+        autopilot.spoof_ned_m, autopilot.gnss_noise = signal.offset_ned_m, signal.noise
         truth = vehicle.truth
         out = autopilot.step(self.boot_ns(self._now_ns), truth, dt)
         self.samples.append(

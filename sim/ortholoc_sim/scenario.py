@@ -62,13 +62,16 @@ class MapTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 class RouteTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """``[route]``: ``waypoints_m`` are (east, north) from the world's south-west corner; the flight begins at the first,
-    ``climb_m`` below the height of flight, and ends after ``duration_s``, or with the route if that is left out."""
+    """``[route]``: ``waypoints_m`` are (east, north) from the world's south-west corner, corners rounded with
+    ``corner_radius_m`` where their legs have room for it: at 12 m/s a vehicle that accelerates at 2.5 m/s2 can't fly a
+    tighter one than 58 m. The flight begins at the first, ``climb_m`` below the height of flight, and ends after
+    ``duration_s``, or with the route if that is left out."""
 
     waypoints_m: Annotated[tuple[Pair, ...], Meta(min_length=2)]
     height_agl_m: Positive = 120.0
     speed_m_s: Positive = 12.0
     climb_m: Annotated[float, Meta(ge=0)] = 20.0
+    corner_radius_m: Annotated[float, Meta(ge=0)] = 120.0
     duration_s: Positive | None = None
 
 

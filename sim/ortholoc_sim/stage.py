@@ -31,7 +31,7 @@ from ortholoc_edge.tiles.georeference import Georeference
 from ortholoc_edge.tiles.vertical import derive_offsets
 from ortholoc_sim.camera import Placement, Renderer, Sensor
 from ortholoc_sim.country import FRAME
-from ortholoc_sim.crossdomain import CrossDomain, Kind
+from ortholoc_sim.crossdomain import CrossDomain, Kind, MapLayers
 from ortholoc_sim.noise import blobs
 from ortholoc_sim.scenario import CameraTable, MapTable, Scenario, WorldTable
 from ortholoc_sim.site import Site
@@ -109,11 +109,15 @@ def pack_for(scenario: Scenario, folder: Path) -> Path:
     return damaged
 
 
-def _build(world: WorldTable, table: MapTable, out: Path) -> None:
-    domain = _domain(world, table.kind, table.world_seed)
+@lru_cache(maxsize=1)
+def _layers(world: WorldTable, kind: Kind, seed: int | None) -> MapLayers:
+    domain = _domain(world, kind, seed)
     survey = domain.survey_scene()
-    surface = domain.flight_scene().surface if table.kind is Kind.XDOP else survey.surface
-    layers = domain.layers(survey, surface)
+    return domain.layers(survey, domain.flight_scene().surface if kind is Kind.XDOP else survey.surface)
+
+
+def _build(world: WorldTable, table: MapTable, out: Path) -> None:
+    layers = _layers(world, table.kind, table.world_seed)
     dop, dsm = layers.dop, layers.dsm + np.float32(table.height_error_m)
     if table.mirrored:
         dop, dsm = np.ascontiguousarray(dop[:, ::-1]), np.ascontiguousarray(dsm[:, ::-1])
