@@ -31,9 +31,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "loopback UDP socket to a simulated autopilot that steers by it. Exit code 1 if it failed to localize. With "
         "--scenario, flies what a file describes, on simulated time; only --out, --seed and --json go with that.",
     )
-    parser.add_argument(
-        "--out", type=Path, default=Path("out"), metavar="DIR", help="for the results (default: out)"
-    )
+    parser.add_argument("--out", type=Path, default=Path("out"), metavar="DIR", help="for the results (default: out)")
     parser.add_argument("--seed", type=seed, default=1, help="of sensor errors, wind and noise (default: %(default)s)")
     parser.add_argument(
         "--duration", type=positive, default=65.0, metavar="S", help="of the flight, at least 30 (default: %(default)s)"

@@ -42,7 +42,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument("--list-scenarios", action="store_true", help="tell which are shipped, and end")
     group.add_argument(
-        "--seeds", type=positive_int, default=1, metavar="K", help="fly with so many seeds from --seed on (default: %(default)s)"
+        "--seeds",
+        type=positive_int,
+        default=1,
+        metavar="K",
+        help="fly with so many seeds from --seed on (default: %(default)s)",
     )
     group.add_argument("--short", action="store_true", help="the short form of each: a small world, some seconds")
     group.add_argument(

@@ -262,8 +262,8 @@ def _problems(flown: Flown, result: Result) -> Iterator[str]:  # noqa: PLR0912 -
 
 
 def write_files(judged: Judged, out: Path) -> None:
-    """Write `RESULT`, `FRAMES` and `TRACK`, which are the same bytes for the same scenario and seed, and `TIMES`, which is
-    not. Raises: OrtholocError if that fails."""
+    """Write `RESULT`, `FRAMES` and `TRACK`, the same bytes for the same scenario and seed, and `TIMES`, which is not.
+    Raises: OrtholocError if that fails."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         result = _rounded(msgspec.to_builtins(judged.result))

@@ -1,6 +1,6 @@
 """A scenario flown on simulated time: one loop owns the clock, so that the same scenario and seed give the same flight.
 
-    autopilot and vehicle (`loop`) ⇄ bytes on a line (`line`) ⇄ the daemon's link, worker and reports, without its threads
+    autopilot and vehicle (`loop`) ⇄ bytes on a line (`line`) ⇄ the daemon's link, worker and reports, no threads
 
 The daemon is the real one. What its threads would do at once takes the time that a scenario says: frames are there
 ``delay_ms`` after the exposure, the worker is busy for a latency drawn by lot, and the latest frame wins meanwhile.
@@ -22,7 +22,6 @@ from ortholoc_edge.adapters.mavlink.codec import FrameParser, dialect
 from ortholoc_edge.clock import ManualClock
 from ortholoc_edge.config import Config, MapOptions
 from ortholoc_edge.daemon import STATE_WAIT_NS, Daemon, Localized
-from ortholoc_edge.errors import ConfigError
 from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.frame import Frame
@@ -333,7 +332,8 @@ class _Flight:
             daemon.close()
         return Flown(
             self.scenario, self.seed, self._loop, self._grounds.site, self._route, self._pack, tuple(worker.done),
-            camera.exposed, worker.replaced, tuple(self._said), dict(self._line.counts), statistics, time.monotonic() - began,
+            camera.exposed, worker.replaced, tuple(self._said), dict(self._line.counts), statistics,
+            time.monotonic() - began,
         )  # fmt: skip
 
     def _arrived(self) -> bool:

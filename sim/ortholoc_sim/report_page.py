@@ -73,14 +73,18 @@ def write_page(judged: Judged, path: Path) -> None:
 
 def _head(judged: Judged) -> str:
     r = judged.result
-    badge = '<span class="badge ok">as expected</span>' if r.passed else '<span class="badge bad">not as expected</span>'
+    word, shade = ("as expected", "ok") if r.passed else ("not as expected", "bad")
+    badge = f'<span class="badge {shade}">{word}</span>'
     event = "never" if r.event_s is None else f"from {r.event_s:g} s"
     nees = "-" if r.nees.pose is None else (
         f"{r.nees.pose:.2f} (position {r.nees.position:.2f}, attitude {r.nees.attitude:.2f}); 1 is honest"
     )  # fmt: skip
     rejected = ", ".join(f"{reason} {count}" for reason, count in r.rejections.items()) or "none"
     rows = [
-        ("flight", f"{r.flown_m:.0f} m in {r.duration_s:.0f} s, map {r.map_kind}, seed {r.seed}, GNSS disturbed {event}"),
+        (
+            "flight",
+            f"{r.flown_m:.0f} m in {r.duration_s:.0f} s, GNSS disturbed {event}; map {r.map_kind}, seed {r.seed}",
+        ),
         ("frames", f"{r.exposed} taken, {r.replaced} replaced by newer ones, {r.fixes} of {r.frames} gave a fix"),
         ("refused", rejected),
         ("false fixes", f"{r.false_fixes}"),
@@ -142,7 +146,7 @@ def _map(judged: Judged, store: MapStore) -> str:
         _line_px(grid.px_from_map(judged.believed_map_m[:, :2]), _AUTOPILOT, 2.5),
         _line_px(grid.px_from_map(judged.true_map_m[:, :2]), _TRUTH, 2.5),
     ]
-    if len(fixes):
+    if len(fixes) > 0:
         parts += [_dot(u, v, _VISION, 2.2) for u, v in _thinned(grid.px_from_map(fixes[:, :2]))]
     for event in judged.flown.scenario.gnss:
         parts.append(_mark(judged, grid, event.from_s, f"GNSS {event.kind}"))
@@ -247,7 +251,7 @@ def _charts(judged: Judged) -> str:
         [("error of what it believes", _AUTOPILOT), ("truth off the route", _TRUTH),
          ("dead reckoning alone (may leave the chart)", _DEAD)],
     )  # fmt: skip
-    if len(fixes):
+    if fixes:
         chart(
             "Fixes: error and what they say of it", "m, three-dimensional", _Axes(end_s, 0.0, _top(error, sigma)),
             lambda axes: _line(axes, fix_t, sigma, _SIGMA) + _dots(axes, fix_t, error, _VISION),
@@ -290,7 +294,8 @@ def _time_axis(axes: _Axes, bottom: float) -> str:
         f'<text x="{axes.x(k * step):.1f}" y="{bottom + 16}" text-anchor="middle">{k * step:g}</text>'
         for k in range(math.floor(axes.end_s / step) + 1)
     )
-    return f'<path d="M{_LEFT} {bottom}H{_WIDTH - _RIGHT}" stroke="#64748b"/>{ticks}<text x="2" y="{bottom + 16}">s</text>'
+    line = f'<path d="M{_LEFT} {bottom}H{_WIDTH - _RIGHT}" stroke="#64748b"/>'
+    return f'{line}{ticks}<text x="2" y="{bottom + 16}">s</text>'
 
 
 def _events(judged: Judged, axes: _Axes, height: float = _HEIGHT) -> str:
@@ -377,7 +382,9 @@ def _dot(u: float, v: float, colour: str, radius: float) -> str:
 
 
 def _legend(entries: Sequence[tuple[str, str]]) -> str:
-    spans = "".join(f'<span><i style="border-color:{colour}"></i>{html.escape(name)}</span>' for name, colour in entries)
+    spans = "".join(
+        f'<span><i style="border-color:{colour}"></i>{html.escape(name)}</span>' for name, colour in entries
+    )
     return f'<p class="legend">{spans}</p>'
 
 

@@ -124,14 +124,12 @@ class GimbalTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     error_deg: Pair = (0.3, -0.4)
 
     def options(self) -> GimbalOptions:
-        return GimbalOptions(
-            self.pitch_deg, self.sweep_deg, self.sweep_s, self.yaw_deg, self.delay_ms, self.error_deg
-        )
+        return GimbalOptions(self.pitch_deg, self.sweep_deg, self.sweep_s, self.yaw_deg, self.delay_ms, self.error_deg)
 
 
 class AutopilotTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """``[autopilot]``: ``stamps`` and ``viso_delay_ms`` as in `autopilot.FilterOptions`; ``yaw_error_deg``: constant, of
-    the heading that it believes; ``system_id``: its own."""
+    """``[autopilot]``: ``stamps`` and ``viso_delay_ms`` as in `autopilot.FilterOptions`; ``yaw_error_deg``: constant,
+    of the heading that it believes; ``system_id``: its own."""
 
     stamps: Literal["timesync", "jitter"] = "jitter"
     viso_delay_ms: Annotated[float, Meta(ge=0, le=250)] = 10.0
@@ -196,7 +194,7 @@ class Expectations(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     """``[expect]``: what must come of it.
 
     Attributes:
-        route_p95_m: limit of the true horizontal distance from the route, 95th percentile, from the first GNSS event on.
+        route_p95_m: limit of the true horizontal distance from the route, 95th percentile, since the first GNSS event.
         lost_m: the vehicle must have been at least so far from where it believed it was.
         false_fixes: most of them.
         fixed: least and most share of the frames that give a fix.
@@ -261,6 +259,7 @@ class Scenario(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
                     f"waypoint ({east:g}, {north:g}) lies outside the world of {self.world.width_m:g} x "
                     f"{self.world.height_m:g} m"
                 )
+
 
 def shipped() -> dict[str, Path]:
     """The scenarios that come with the package, by name."""

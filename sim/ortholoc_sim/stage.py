@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
 import shutil
 import tempfile
 from collections.abc import Callable, Sequence
@@ -152,7 +151,7 @@ def _put_whole(out: Path, make: Callable[[Path], object]) -> None:
     scratch = Path(tempfile.mkdtemp(dir=out.parent))
     try:
         make(scratch / "pack")
-        os.replace(scratch / "pack", out)
+        (scratch / "pack").replace(out)
     except OSError:
         # Another process may have been faster; its pack is as good.
         if not out.is_dir():
