@@ -31,8 +31,9 @@ _REASONS = ("#475569", "#b45309", "#0e7490", "#7c2d12", "#4d7c0f", "#86198f", "#
 _MAP_PX, _MAP_MARGIN_M = 900, 60.0
 _JPEG_QUALITY = 72
 _WIDTH, _HEIGHT = 900, 150
-_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 12, 10, 24
+_LEFT, _RIGHT, _TOP, _BOTTOM = 130, 12, 10, 24
 _MOST_POINTS = 900
+_FIX_DOT_PX = 3.2
 _THUMB_PX = 400
 # 95 % of NEES of six degrees of freedom, over six, lie between.
 _NEES_BAND = (1.237 / 6.0, 14.449 / 6.0)
@@ -142,12 +143,16 @@ def _map(judged: Judged, store: MapStore) -> str:
         f'<svg viewBox="0 0 {width} {height}" width="{width}" height="{height}" role="img" '
         'aria-label="map with the tracks of the flight">',
         f'<image href="{_jpeg(image)}" width="{width}" height="{height}" opacity="0.75"/>',
-        _line_px(grid.px_from_map(route), _ROUTE, 2.0, "8 6"),
-        _line_px(grid.px_from_map(judged.believed_map_m[:, :2]), _AUTOPILOT, 2.5),
-        _line_px(grid.px_from_map(judged.true_map_m[:, :2]), _TRUTH, 2.5),
+        _line_px(grid.px_from_map(route), "#fff", 6.0),
+        _line_px(grid.px_from_map(route), _ROUTE, 1.5, "8 6"),
     ]
     if len(fixes) > 0:
-        parts += [_dot(u, v, _VISION, 2.2) for u, v in _thinned(grid.px_from_map(fixes[:, :2]))]
+        parts += [_dot(u, v, _VISION, _FIX_DOT_PX) for u, v in _thinned(grid.px_from_map(fixes[:, :2]))]
+    # Over the dots, and the truth last: where all is well the lines lie on each other.
+    parts += [
+        _line_px(grid.px_from_map(judged.believed_map_m[:, :2]), _AUTOPILOT, 2.0),
+        _line_px(grid.px_from_map(judged.true_map_m[:, :2]), _TRUTH, 1.4),
+    ]
     for event in judged.flown.scenario.gnss:
         parts.append(_mark(judged, grid, event.from_s, f"GNSS {event.kind}"))
     for fault in judged.flown.scenario.fault:
@@ -326,7 +331,7 @@ def _outcomes(judged: Judged, end_s: float) -> str:
     for k, reason in enumerate(judged.result.rejections):
         mine = [f for f in frames if not isinstance(f.outcome, Fix) and str(f.outcome.reason) == reason]
         rows.append((reason, _REASONS[k % len(_REASONS)], mine))
-    left, row_px = 130, 20
+    left, row_px = _LEFT, 20
     height = _TOP + _BOTTOM + row_px * len(rows)
     scale = (_WIDTH - left - _RIGHT) / end_s
     parts = [f'<svg viewBox="0 0 {_WIDTH} {height}" width="{_WIDTH}" height="{height}">']

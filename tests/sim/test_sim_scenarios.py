@@ -213,7 +213,7 @@ def test_the_map_shows_the_flight_where_it_was(flight: Flight, tmp_path: Path) -
     truth = lines[-1]
     assert truth[-1, 0] - truth[0, 0] > 50 and abs(truth[-1, 1] - truth[0, 1]) < 20
     dots = np.array([(float(dot.attrib["cx"]), float(dot.attrib["cy"])) for dot in root.iter("circle")
-                     if dot.attrib["r"] == "2.2"])  # fmt: skip
+                     if dot.attrib["r"] == "3.2"])  # fmt: skip
     assert len(dots) == judged.result.fixes
     nearest = np.linalg.norm(dots[:, None] - truth[None], axis=2).min(axis=1)
     assert nearest.max() < 8.0
@@ -343,11 +343,11 @@ def test_a_rolling_shutter_shows_each_row_from_where_it_was() -> None:
     assert times[0] < 0 < times[-1] and times[-1] - times[0] == pytest.approx(15.0 * 11 / 12)
     eye = np.append(grounds.low_m + 200.0, grounds.ground_m + 90.0)
     pose = Rigid3(frames.map_from_ned_rotation(0.0) @ frames.BODY_FROM_NADIR_CAMERA, eye)
-    moved = [Rigid3(pose.rotation, eye + np.array([0.0, 1.5 * t_ms, 0.0])) for t_ms in times]
+    moved = [Rigid3(pose.rotation, eye + np.array([0.0, 0.3 * t_ms, 0.0])) for t_ms in times]
     still, rolling = (studio.picture(poses, None, 1).astype(int) for poses in ([pose] * len(times), moved))
     middle = studio.camera.height // 2
     difference = np.abs(still - rolling).mean(axis=(1, 2))
-    assert difference[middle - 5 : middle + 5].mean() < 0.3 * difference[:20].mean()
+    assert difference[middle - 5 : middle + 5].mean() < 0.5 * difference[:20].mean()
     # A shutter that opens for longer smears.
     smeared = studio.picture([pose] * len(times), (moved[0], moved[-1]), 1).astype(int)
     assert np.abs(np.diff(smeared, axis=0)).mean() < 0.8 * np.abs(np.diff(still, axis=0)).mean()
