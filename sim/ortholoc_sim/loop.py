@@ -163,7 +163,7 @@ class ClosedLoop:
         self._now_ns += STEP_NS
         signal = gnss_at(self.options.gnss, (self._now_ns - self._start_ns) / _S)
         autopilot.gnss = signal.available and self._now_ns < self.gnss_lost_ns
-        autopilot.spoof_ned_m, autopilot.gnss_noise = signal.offset_ned_m, signal.noise
+        autopilot.gnss_offset_m, autopilot.gnss_noise = signal.offset_ned_m, signal.noise
         truth = vehicle.truth
         out = autopilot.step(self.boot_ns(self._now_ns), truth, dt)
         self.samples.append(
