@@ -96,7 +96,9 @@ class Line:
 
 
 class LineTransport:
-    """The companion's end of a line; a `mavlink.transport.Transport`."""
+    """The companion's end of a line; a `mavlink.transport.Transport`, which cuts no frame."""
+
+    cut_datagrams = 0
 
     def __init__(self, line: Line, clock: Clock) -> None:
         self._line, self._clock = line, clock

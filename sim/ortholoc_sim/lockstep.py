@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 import math
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -208,6 +209,9 @@ class _Worker:
     def __init__(self, flight: _Flight, daemon: Daemon, latency: LatencyTable) -> None:
         self._flight, self._daemon, self._latency = flight, daemon, latency
         self._rng = np.random.default_rng([flight.seed, 64])
+        # Whether the autopilot's state is there is seen here; the daemon must not wait while time stands still.
+        self._at_once = threading.Event()
+        self._at_once.set()
         self._slot: tuple[Frame, Rigid3] | None = None
         self._work: _Work | None = None
         self.replaced = 0
@@ -249,7 +253,7 @@ class _Worker:
             searched_ms += factor * self._latency.hypothesis_ms
             return (now_ns - stamp_ns) / _MS + searched_ms < self._flight.scenario.timing.max_age_ms
 
-        work.localized = self._daemon.localize(work.frame, self._daemon.link.state_at(stamp_ns), proceed)
+        work.localized = self._daemon.localize(work.frame, self._at_once, proceed)
         outcome = work.localized.outcome
         spent_ms = took_ms * factor + searched_ms if "match" in outcome.timings_ms else _REFUSED_MS
         work.ready_ns = now_ns + round(spent_ms * _MS)
@@ -324,7 +328,7 @@ class _Flight:
                     for frame, truth in camera.arrived(now_ns):
                         worker.put(frame, truth)
                     worker.step(now_ns)
-                daemon.report_status()
+                daemon.report()
                 daemon.link.exchange(self._transport)
                 progress((now_ns - START_NS) / _S)
             statistics = daemon.statistics()
