@@ -22,12 +22,13 @@ from ortholoc_edge.adapters.camera import CameraOptions
 from ortholoc_edge.adapters.mavlink.codec import FrameParser, dialect
 from ortholoc_edge.clock import ManualClock
 from ortholoc_edge.config import Config, MapOptions
-from ortholoc_edge.daemon import STATE_WAIT_NS, Daemon, Localized
+from ortholoc_edge.daemon import Daemon, Localized
 from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.navigator import TimingOptions
 from ortholoc_edge.pipeline.outcome import Fix, Outcome
+from ortholoc_edge.vehicle import STATE_WAIT_NS
 from ortholoc_sim.autopilot import AutopilotOptions, Message, SensorOptions
 from ortholoc_sim.line import End, Line, LineTransport
 from ortholoc_sim.loop import STEP_NS, ClosedLoop, LoopOptions
