@@ -29,7 +29,7 @@ from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.navigator import TimingOptions
 from ortholoc_edge.pipeline.outcome import Fix, Outcome
 from ortholoc_edge.vehicle import STATE_WAIT_NS
-from ortholoc_sim.autopilot import AutopilotOptions, Message, SensorOptions
+from ortholoc_sim.autopilot import Message
 from ortholoc_sim.line import End, Line, LineTransport
 from ortholoc_sim.loop import STEP_NS, ClosedLoop, LoopOptions
 from ortholoc_sim.rounded import rounded
@@ -283,6 +283,9 @@ class _Flight:
         self.scenario, self.seed = scenario, seed
         self._pack = pack_for(scenario, folder)
         self._grounds = make_grounds(scenario.world, scenario.map.kind)
+        site = self._grounds.site
+        # The ground is the same for all; its local frame is the autopilot's own.
+        self._site = Site(site.georeference, site.anchor_map_m, scenario.autopilot.stack)
         self._clock = ManualClock(START_NS)
         self._route = self._route_map()
         length_m = float(np.linalg.norm(np.diff(self._route[:, :2], axis=0), axis=1).sum())
@@ -292,7 +295,7 @@ class _Flight:
         self.duration_s = table.duration_s or _LEEWAY * length_m / table.speed_m_s + 20.0
         self._line = Line(scenario.line, seed)
         self._transport = LineTransport(self._line, self._clock)
-        self._loop = ClosedLoop(self._grounds.site, self._loop_options(), START_NS)
+        self._loop = ClosedLoop(self._site, self._loop_options(), START_NS)
         self._said: list[tuple[float, str]] = []
         self._text_parts: dict[int, str] = {}
         self._ours, self._theirs = FrameParser(), dialect.MAVLink(None, scenario.autopilot.system_id, 1)
@@ -336,7 +339,7 @@ class _Flight:
         finally:
             daemon.close()
         return Flown(
-            self.scenario, self.seed, self._loop, self._grounds.site, self._route, self._pack, tuple(worker.done),
+            self.scenario, self.seed, self._loop, self._site, self._route, self._pack, tuple(worker.done),
             camera.exposed, worker.replaced, tuple(self._said), dict(self._line.counts), statistics,
             time.monotonic() - began,
         )  # fmt: skip
@@ -345,7 +348,7 @@ class _Flight:
         if not self._until_arrival or not self._loop.on_last_leg:
             return False
         # By what it believes: a vehicle that is lost ends where it thinks that the route ends.
-        site = self._grounds.site
+        site = self._site
         believed = site.map_from_ned(site.ned_from_autopilot(self._loop.samples[-1].estimate_m))
         return float(np.hypot(*(believed - self._route[-1])[:2])) < _ARRIVED_M
 
@@ -384,10 +387,15 @@ class _Flight:
         down = self.fault("line_down", now_ns) is not None
         self._line.down[End.AUTOPILOT] = down
         self._line.down[End.COMPANION] = down or self.fault("autopilot_mute", now_ns) is not None
-        step = self.fault("clock_steps", now_ns)
-        if step is not None and step not in stepped and step.amount is not None:
-            stepped.add(step)
-            self._loop.step_clock(round(step.amount * _MS))
+        for kind in ("clock_steps", "autopilot_reboots"):
+            once = self.fault(kind, now_ns)
+            if once is None or once in stepped:
+                continue
+            stepped.add(once)
+            if once.amount is not None:
+                self._loop.step_clock(round(once.amount * _MS))
+            else:
+                self._loop.autopilot.reboot()
 
     # -- what it is made of ----------
 
@@ -404,11 +412,7 @@ class _Flight:
         return LoopOptions(
             self._route, scenario.route.speed_m_s, scenario.route.climb_m, _NEVER_S, scenario.gnss,
             VehicleOptions(wind_ned_m_s=wind, gust_m_s=scenario.wind.gust_m_s),
-            AutopilotOptions(
-                seed=self.seed + 3, system_id=scenario.autopilot.system_id, filter=scenario.autopilot.filter(),
-                sensors=SensorOptions(yaw_bias_deg=scenario.autopilot.yaw_error_deg),
-                gimbal=None if scenario.gimbal is None else scenario.gimbal.options(),
-            ),
+            scenario.autopilot.options(self.seed + 3, None if scenario.gimbal is None else scenario.gimbal.options()),
             self.seed,
         )  # fmt: skip
 
@@ -435,7 +439,7 @@ class _Flight:
         else:
             turned = gimbal.ned_from_gimbal(truth.ned_from_body, self._loop.boot_ns(stamp_ns))
             mounted = mount.body_from_camera_in(truth.ned_from_body.T @ turned)
-        return self._grounds.site.camera_pose(truth.position_ned_m, truth.ned_from_body, mounted)
+        return self._site.camera_pose(truth.position_ned_m, truth.ned_from_body, mounted)
 
 
 class _NoFrames:

@@ -20,7 +20,8 @@ from ortholoc_edge.errors import ConfigError
 from ortholoc_edge.pipeline.outcome import Reason
 from ortholoc_edge.pipeline.tracker import TrackerOptions
 from ortholoc_edge.pipeline.witness import WitnessOptions
-from ortholoc_sim.autopilot import FilterOptions, GimbalOptions, Verdict
+from ortholoc_sim.autopilot import AutopilotOptions, FilterOptions, GimbalOptions, SensorOptions, Verdict
+from ortholoc_sim.autopilot.options import KNOWN
 from ortholoc_sim.crossdomain import Kind
 from ortholoc_sim.gnss import GnssEvent
 from ortholoc_sim.line import LineOptions
@@ -128,16 +129,45 @@ class GimbalTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
 
 class AutopilotTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """``[autopilot]``: ``stamps`` and ``viso_delay_ms`` as in `autopilot.FilterOptions`; ``yaw_error_deg``: constant,
-    of the heading that it believes; ``system_id``: its own."""
+    """``[autopilot]``: who flies.
+
+    Attributes:
+        stack, firmware: whose rules, of which version; None: the newest known. switching: see
+            `autopilot.AutopilotOptions`.
+        stamps, viso_delay_ms: see `autopilot.FilterOptions`; PX4 has "timesync" whatever is written.
+        yaw_error_deg: constant, of the heading that it believes. system_id: its own.
+    """
+
+    stack: Literal["ardupilot", "px4"] = "ardupilot"
+    firmware: tuple[int, int, int] | None = None
+    switching: Literal["script", "command"] = "script"
 
     stamps: Literal["timesync", "jitter"] = "jitter"
     viso_delay_ms: Annotated[float, Meta(ge=0, le=250)] = 10.0
     yaw_error_deg: float = 2.0
     system_id: Annotated[int, Meta(ge=1, le=255)] = 1
 
-    def filter(self) -> FilterOptions:
-        return FilterOptions(stamps=self.stamps, viso_delay_ms=self.viso_delay_ms)
+    def __post_init__(self) -> None:
+        # Its own checks name what can't be simulated; msgspec adds the table.
+        self.options(0, None)
+
+    def options(self, seed: int, gimbal: GimbalOptions | None) -> AutopilotOptions:
+        oldest_and_newest = KNOWN[self.stack]
+        return AutopilotOptions(
+            seed=seed,
+            system_id=self.system_id,
+            firmware=self.firmware or (*oldest_and_newest[1], 0),
+            sensors=SensorOptions(yaw_bias_deg=self.yaw_error_deg),
+            filter=FilterOptions(
+                stamps="timesync" if self.stack == "px4" else self.stamps,
+                viso_delay_ms=self.viso_delay_ms,
+                # It was synchronised before the flight began: 50 s of it would be the shorter part.
+                converged_after=0,
+            ),
+            gimbal=gimbal,
+            stack=self.stack,
+            switching=self.switching,
+        )
 
 
 class LatencyTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -161,7 +191,7 @@ class TimingTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
 FaultKind = Literal[
     "camera_stalls", "frames_black", "frames_duplicated", "frames_out_of_order", "frames_late", "frames_frozen",
-    "frames_of_water", "line_down", "autopilot_mute", "clock_steps", "computer_slow",
+    "frames_of_water", "line_down", "autopilot_mute", "autopilot_reboots", "clock_steps", "computer_slow",
 ]  # fmt: skip
 
 
