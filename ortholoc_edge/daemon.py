@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import Counter
+from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,10 +27,10 @@ from ortholoc_edge.config import Config
 from ortholoc_edge.errors import CameraError, LinkError, MapError, OrtholocError
 from ortholoc_edge.matching.registry import make_method
 from ortholoc_edge.matching.types import STRUCTURAL, AnyMatcher
-from ortholoc_edge.pipeline.frame import Frame
+from ortholoc_edge.pipeline.frame import Frame, VehicleState
 from ortholoc_edge.pipeline.localizer import Localizer
 from ortholoc_edge.pipeline.navigator import Navigator
-from ortholoc_edge.pipeline.outcome import Fix, Reason, Rejected
+from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.tracker import Tracker
 from ortholoc_edge.pose import pnp
 from ortholoc_edge.reporting import OutcomeListener, Reporter
@@ -72,6 +73,19 @@ class LatestSlot(Generic[T]):
                 self._condition.wait(timeout_s)
             item, self._item = self._item, None
             return item
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Localized:
+    """A frame between the two halves of its way: what it came to, before that is sent.
+
+    Attributes:
+        state: of the vehicle at the exposure, as it was known then.
+    """
+
+    frame: Frame
+    outcome: Outcome
+    state: VehicleState
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +184,14 @@ class Daemon:
     def link(self) -> AutopilotLink:
         return self._link
 
+    @property
+    def navigator(self) -> Navigator:
+        return self._navigator
+
+    def close(self) -> None:
+        """Release what a daemon holds that is never run; `run` does that itself. Idempotent."""
+        self._resources.close()
+
     def statistics(self) -> dict[str, Statistic]:
         """See :meth:`Reporter.statistics`; and how many frames a newer one took the place of."""
         return {**self._reporter.statistics(), "frames_replaced": self._slot.replaced}
@@ -242,7 +264,7 @@ class Daemon:
             # Before the slot is looked at: what came before the end must still be taken.
             ended = self._ended.is_set()
             item = self._slot.take(_WAIT_S)
-            self._report()
+            self.report()
             if item is None:
                 if ended:
                     return
@@ -260,7 +282,8 @@ class Daemon:
                 if errors >= _MAX_ERRORS_IN_A_ROW:
                     raise OrtholocError(f"{errors} frames in a row failed, last with {error!r}") from error
 
-    def _report(self) -> None:
+    def report(self) -> None:
+        """Tell the autopilot, the ground station and systemd how it goes, where it is time for that."""
         try:
             self._reporter.step(self._clock.now_ns())
         except Exception:  # a defect there must not end what it reports of, and would again after each restart
@@ -280,13 +303,27 @@ class Daemon:
     # -- one frame -------------------------------------------------------------------------------------
 
     def _handle(self, frame: Frame, stop: threading.Event) -> None:
-        state = self._vehicle.at(frame.stamp_ns, stop)
-
         def proceed() -> bool:
             self._feed_watchdog()
             return self._age_ms(frame.stamp_ns) < self._config.timing.max_age_ms and not stop.is_set()
 
-        outcome = self._navigator.step(frame, state, proceed)
+        self.settle(self.localize(frame, stop, proceed))
+
+    # An owner of simulated time calls these two itself, without threads, and lets time pass between them.
+
+    def localize(self, frame: Frame, stop: threading.Event, proceed: Callable[[], bool]) -> Localized:
+        """What a frame comes to.
+
+        Args:
+            stop: when it is set, the autopilot's state at the exposure is taken as it is known, and not waited for.
+            proceed: see `Localizer.localize`.
+        """
+        state = self._vehicle.at(frame.stamp_ns, stop)
+        return Localized(frame, self._navigator.step(frame, state, proceed), state)
+
+    def settle(self, localized: Localized) -> Outcome:
+        """Send and publish it; returns the outcome, which is a rejection where a fix came too late to be sent."""
+        frame, outcome = localized.frame, localized.outcome
         if isinstance(outcome, Fix):
             age_ms, limit_ms = self._age_ms(frame.stamp_ns), self._config.timing.max_age_ms
             if age_ms > limit_ms:
@@ -294,8 +331,9 @@ class Daemon:
                 late = Rejected(frame.stamp_ns, Reason.LATE, "a fix, but too old to send, ms", age_ms, limit_ms)
                 outcome = replace(late, timings_ms=outcome.timings_ms)
             else:
-                self._vehicle.tell(outcome, state)
+                self._vehicle.tell(outcome, localized.state)
         self._reporter.publish(frame, outcome)
+        return outcome
 
     def _age_ms(self, stamp_ns: int) -> float:
         return (self._clock.now_ns() - stamp_ns) / 1e6

@@ -26,7 +26,7 @@ from ortholoc_edge.tiles.georeference import Georeference
 logger = logging.getLogger(__name__)
 
 # The autopilot's attitude for an exposure arrives after it; the frame waits this long for it at most.
-_STATE_WAIT_NS = 150_000_000
+STATE_WAIT_NS = 150_000_000
 
 
 class Vehicle:
@@ -59,7 +59,7 @@ class Vehicle:
 
     def at(self, stamp_ns: int, stop: threading.Event) -> VehicleState:
         """The vehicle's state at an exposure, waiting a little for the telemetry that follows it."""
-        deadline_ns = self._clock.now_ns() + _STATE_WAIT_NS
+        deadline_ns = self._clock.now_ns() + STATE_WAIT_NS
         while True:
             known = self._link.state_at(stamp_ns)
             is_final = known is not None and known.interpolated

@@ -1,4 +1,4 @@
-"""``sim``: a simulated flight without GNSS, with the real daemon and real MAVLink; no hardware, no other data."""
+"""``sim``: simulated flights without GNSS, with the real daemon and real MAVLink; no hardware, no other data."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from ortholoc_edge.bench.metrics import Spread
-from ortholoc_edge.cli import matcher_options
+from ortholoc_edge.cli import matcher_options, sim_scenarios
 from ortholoc_edge.cli.arguments import non_negative, positive, seed, writable_folder
 from ortholoc_edge.errors import ConfigError, OrtholocError
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
@@ -25,14 +25,13 @@ if TYPE_CHECKING:
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = subparsers.add_parser(
         "sim",
-        help="fly a simulated minute without GNSS",
+        help="fly a simulated minute without GNSS, or scenarios",
         description="Flies a simulated vehicle over a generated world in real time. GNSS is cut off after takeoff; "
         "the real daemon localizes rendered camera frames on the committed demo pack and sends MAVLink over a "
-        "loopback UDP socket to a simulated autopilot that steers by it. Exit code 1 if it failed to localize.",
+        "loopback UDP socket to a simulated autopilot that steers by it. Exit code 1 if it failed to localize. With "
+        "--scenario, flies what a file describes, on simulated time; only --out, --seed and --json go with that.",
     )
-    parser.add_argument(
-        "--out", type=Path, default=Path("out"), metavar="DIR", help="for track.png and summary.json (default: out)"
-    )
+    parser.add_argument("--out", type=Path, default=Path("out"), metavar="DIR", help="for the results (default: out)")
     parser.add_argument("--seed", type=seed, default=1, help="of sensor errors, wind and noise (default: %(default)s)")
     parser.add_argument(
         "--duration", type=positive, default=65.0, metavar="S", help="of the flight, at least 30 (default: %(default)s)"
@@ -57,11 +56,16 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="have the autopilot believe a fix's stamp instead, as PX4 does; --viso-delay-ms then counts for nothing",
     )
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    sim_scenarios.add_arguments(parser)
     matcher_options.add(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
+    if args.list_scenarios:
+        return sim_scenarios.list_scenarios()
+    if args.scenario:
+        return sim_scenarios.fly_scenarios(args)
     # Not at the top: every other command works without the simulation.
     from ortholoc_sim import demo_pack_path
     from ortholoc_sim.autopilot import AutopilotOptions, FilterOptions

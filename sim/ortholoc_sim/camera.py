@@ -33,6 +33,8 @@ _CELLS_M = (8.0, 2.0, 0.5)
 _STRIDES = (14, 14, 10)
 _MAX_FINE_STEPS = 400
 _BISECTIONS = 6
+# Whose rays are kept: a rolling shutter's strips are cameras of their own.
+_MAX_CAMERAS = 32
 _STOREY_M, _WINDOW_EVERY_M = 2.9, 2.6
 
 
@@ -114,11 +116,15 @@ class Renderer:
             ],
             dtype=np.float32,
         ).reshape(-1, 11)  # fmt: skip
-        self._rays: tuple[Camera, Float32Array] | None = None
+        self._rays: dict[Camera, Float32Array] = {}
 
     def render(self, camera: Camera, map_from_camera: Rigid3, seed: int = 0) -> ImageArray:
         """(H, W, 3) RGB picture; ``seed`` picks its noise."""
-        return self._exposed(self._trace(camera, map_from_camera)[0], camera, seed)
+        return self.exposed(self.clean(camera, map_from_camera), camera, seed)
+
+    def clean(self, camera: Camera, map_from_camera: Rigid3) -> ImageArray:
+        """(H, W, 3) RGB, without the sensor's flaws."""
+        return self._trace(camera, map_from_camera)[0]
 
     def view(self, camera: Camera, map_from_camera: Rigid3, seed: int = 0) -> View:
         """The picture together with its geometry."""
@@ -126,14 +132,16 @@ class Renderer:
         shape = (camera.height, camera.width)
         local = np.stack([x, y, z], axis=-1).astype(np.float64).reshape(*shape, 3)
         points = local + np.array([self.placement.west_m, self.placement.south_m, 0.0])
-        return View(self._exposed(clean, camera, seed), points, objects.reshape(shape), facade.reshape(shape))
+        return View(self.exposed(clean, camera, seed), points, objects.reshape(shape), facade.reshape(shape))
 
     def _directions(self, camera: Camera) -> Float32Array:
-        if self._rays is None or self._rays[0] != camera:
+        if camera not in self._rays:
             u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
             rays = camera.unproject(np.stack([u, v], axis=-1).reshape(-1, 2))
-            self._rays = (camera, rays.astype(np.float32))
-        return self._rays[1]
+            if len(self._rays) >= _MAX_CAMERAS:
+                self._rays.clear()
+            self._rays[camera] = rays.astype(np.float32)
+        return self._rays[camera]
 
     def _trace(
         self, camera: Camera, map_from_camera: Rigid3
@@ -279,7 +287,8 @@ class Renderer:
         paint = np.where(window[:, None], np.array([52, 60, 72], dtype=np.float32), house[:, 8:11])
         colours[at] = np.clip(paint * light, 0, 255).astype(np.uint8)
 
-    def _exposed(self, clean: ImageArray, camera: Camera, seed: int) -> ImageArray:
+    def exposed(self, clean: ImageArray, camera: Camera, seed: int) -> ImageArray:
+        """What the sensor makes of a clean picture (H, W, 3)."""
         sensor = self.sensor
         image = (
             cv2.GaussianBlur(clean, (0, 0), sensor.blur_px).astype(np.float32)

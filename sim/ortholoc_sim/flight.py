@@ -68,6 +68,8 @@ MAX_AUTOPILOT_ERROR_M = 10.0
 # Without these a flight passed on which the autopilot refused every fix and dead reckoning did well by itself.
 MIN_FUSED_FRACTION = 0.7
 MAX_ERROR_OF_DEAD_RECKONING = 0.5
+# Dead reckoning that is off by less, as in the first twenty seconds, does not show whether anybody helped.
+MIN_DEAD_RECKONING_M = 1.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -618,7 +620,7 @@ def _no_use(fixes_after: int, vision_after: Counter[str], autopilot: list[float]
         # Median against median: drift grows as the square of time, so half of the time it is below a quarter of
         # what it ends with, and a flight that got nothing at all would pass against the end.
         median, alone = float(np.median(autopilot)), float(np.median(reckoned))
-        if median >= MAX_ERROR_OF_DEAD_RECKONING * alone:
+        if alone >= MIN_DEAD_RECKONING_M and median >= MAX_ERROR_OF_DEAD_RECKONING * alone:
             problems.append(
                 f"the autopilot's median error was {median:.1f} m, dead reckoning alone gives {alone:.1f} m; under "
                 f"{MAX_ERROR_OF_DEAD_RECKONING:.0%} of that is wanted"

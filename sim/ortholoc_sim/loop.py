@@ -81,6 +81,7 @@ class ClosedLoop:
     def __init__(self, site: Site, options: LoopOptions, start_ns: int) -> None:
         self.options = options
         self._start_ns = self._now_ns = start_ns
+        self._clock_step_ns = 0
         # As a ground station uploads it: latitude and longitude, which the autopilot turns into its own metres.
         route = [
             site.autopilot_from_ned(site.ned_from_map(waypoint))
@@ -120,13 +121,22 @@ class ClosedLoop:
         return self._now_ns
 
     @property
+    def on_last_leg(self) -> bool:
+        """Whether the guidance flies to the last waypoint."""
+        return self._guidance.leg >= len(self._guidance.waypoints_ned_m) - 2
+
+    @property
     def gnss_lost_ns(self) -> int:
         """When GNSS goes, the owner's clock."""
         return self._start_ns + round(self.options.gnss_until_s * _S)
 
     def boot_ns(self, now_ns: int) -> int:
         """The autopilot's clock at ``now_ns`` of the owner's."""
-        return now_ns - self._start_ns + self.options.autopilot.boot_offset_ns
+        return now_ns - self._start_ns + self.options.autopilot.boot_offset_ns + self._clock_step_ns
+
+    def step_clock(self, by_ns: int) -> None:
+        """Set the autopilot's clock forward, as a defect does."""
+        self._clock_step_ns += by_ns
 
     def owner_ns(self, boot_ns: int) -> int:
         """The owner's clock at a time of the autopilot's."""
