@@ -26,6 +26,7 @@ from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.outcome import Fix
 from ortholoc_sim.autopilot import Verdict
 from ortholoc_sim.lockstep import START_NS, Flown, FlownFrame
+from ortholoc_sim.recorded import NOTICE
 
 _S = 1_000_000_000
 # Of the loop's steps: ten in a second.
@@ -49,6 +50,7 @@ class Result(Struct, frozen=True, kw_only=True):
     """A flight in figures: `RESULT`. Lengths in m, angles in degrees, times in s since the start.
 
     Attributes:
+        notice: what has to be known of the pictures; None for a generated world.
         passed, problems: whether it was as expected, and what was not.
         flown_m: length of the true track. event_s: when GNSS was first disturbed; what is "after" is after this, or
             after 5 s where it never is.
@@ -66,6 +68,7 @@ class Result(Struct, frozen=True, kw_only=True):
     scenario: str
     seed: int
     title: str
+    notice: str | None
     passed: bool
     problems: tuple[str, ...]
     map_kind: str
@@ -152,6 +155,7 @@ def judge(flown: Flown) -> Judged:
         scenario=flown.scenario.name,
         seed=flown.seed,
         title=flown.scenario.title,
+        notice=None if flown.scenario.world.pack is None else NOTICE,
         passed=True,
         problems=(),
         map_kind=str(flown.scenario.map.kind),

@@ -23,6 +23,7 @@ from ortholoc_edge.adapters.mavlink.codec import FrameParser, dialect
 from ortholoc_edge.clock import ManualClock
 from ortholoc_edge.config import Config, MapOptions
 from ortholoc_edge.daemon import Daemon, Localized
+from ortholoc_edge.errors import ConfigError
 from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.frame import Frame
@@ -401,6 +402,13 @@ class _Flight:
 
     def _route_map(self) -> FloatArray:
         table = self.scenario.route
+        spec = self._grounds.scene.spec
+        for east, north in table.waypoints_m:
+            if not (0 <= east <= spec.width_m and 0 <= north <= spec.height_m):
+                raise ConfigError(
+                    f"scenario {self.scenario.name}: waypoint ({east:g}, {north:g}) lies outside the ground of "
+                    f"{spec.width_m:.0f} x {spec.height_m:.0f} m"
+                )
         xy = rounded(np.array(table.waypoints_m), table.corner_radius_m) + self._grounds.low_m
         return np.column_stack([xy, np.full(len(xy), self._grounds.ground_m + table.height_agl_m)])
 

@@ -9,10 +9,11 @@ nothing of what changed on the ground since the map was made. Results have to sa
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
+from msgspec import Struct
 from rasterio.fill import fillnodata
 
 from ortholoc_edge.errors import MapError
@@ -33,8 +34,7 @@ _FILL_M = 30.0
 _TINT_M = 14.0
 
 
-@dataclass(frozen=True, slots=True)
-class Light:
+class Light(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What is other than in the orthophoto.
 
     Attributes:

@@ -35,6 +35,7 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 130, 12, 10, 24
 _MOST_POINTS = 900
 _FIX_DOT_PX = 3.2
 _THUMB_PX = 400
+_GENERATED = "over a generated country, which is no real place"
 # 95 % of NEES of six degrees of freedom, over six, lie between.
 _NEES_BAND = (1.237 / 6.0, 14.449 / 6.0)
 _STYLE = """
@@ -101,7 +102,7 @@ def _head(judged: Judged) -> str:
     table = "".join(f'<tr><th>{name}</th><td class="n">{html.escape(value)}</td></tr>' for name, value in rows)
     return (
         f"<h1>{html.escape(r.title)}</h1><p>{badge} <b>{html.escape(r.scenario)}</b> "
-        '<span class="note">a simulated flight over a generated country; no real place</span></p>'
+        f'<span class="note">{html.escape(f"a simulated flight; {r.notice or _GENERATED}")}</span></p>'
         f"{problems}<table>{table}</table>"
     )
 

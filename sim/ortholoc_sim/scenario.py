@@ -25,6 +25,7 @@ from ortholoc_sim.autopilot.options import KNOWN
 from ortholoc_sim.crossdomain import Kind
 from ortholoc_sim.gnss import GnssEvent
 from ortholoc_sim.line import LineOptions
+from ortholoc_sim.recorded import Light
 
 _NO_LINE = "udpout:127.0.0.1:1"
 SHORT = "short"
@@ -34,8 +35,16 @@ Pair = tuple[float, float]
 
 
 class WorldTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """``[world]``: the place that is flown over; `place.make_place`."""
+    """``[world]``: the place that is flown over: generated (`place.make_place`), or that of an area pack.
 
+    Attributes:
+        pack: folder of an area pack with a reference system and heights above sea level, or "demo", the shipped one.
+            The camera sees its own orthophoto over its own surface model, in another ``light`` (`recorded`); the sizes
+            and the seed are then of no use.
+    """
+
+    pack: str | None = None
+    light: Light = field(default_factory=Light)
     seed: Annotated[int, Meta(ge=0)] = 1
     width_m: Annotated[float, Meta(ge=200, le=3000)] = 1200.0
     height_m: Annotated[float, Meta(ge=200, le=3000)] = 1000.0
@@ -283,6 +292,11 @@ class Scenario(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
                 f"[mount] gimbal = {self.mount.gimbal!r} {'without' if self.gimbal is None else 'with'} a [gimbal] "
                 "table; one goes with the other"
             )
+        if self.world.pack is not None:
+            # Its size is the pack's: `stage.make_grounds` looks.
+            if self.map != MapTable():
+                raise ValueError("[map] is of generated worlds; over [world] pack the map is that pack")
+            return
         for east, north in self.route.waypoints_m:
             if not (0 <= east <= self.world.width_m and 0 <= north <= self.world.height_m):
                 raise ValueError(

@@ -27,11 +27,15 @@ from ortholoc_edge.geometry.grid import RasterGrid
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.tiles.build import PackOptions, build_pack
 from ortholoc_edge.tiles.georeference import Georeference
+from ortholoc_edge.tiles.pack import Pack
+from ortholoc_edge.tiles.store import MapStore
 from ortholoc_edge.tiles.vertical import derive_offsets
+from ortholoc_sim import demo_pack_path
 from ortholoc_sim.camera import Placement, Renderer, Sensor
 from ortholoc_sim.country import FRAME
 from ortholoc_sim.crossdomain import CrossDomain, Kind, MapLayers
 from ortholoc_sim.noise import blobs
+from ortholoc_sim.recorded import Light, scene_of_map
 from ortholoc_sim.scenario import CameraTable, MapTable, Scenario, WorldTable
 from ortholoc_sim.site import Site
 from ortholoc_sim.world import Scene
@@ -44,6 +48,9 @@ UNDULATION_M = 47.3
 _DSM_SIGMA_M = {Kind.SAME: 0.1, Kind.XDOP: 0.1, Kind.XDOPDSM: 0.4}
 _DOP_SIGMA_M = 0.05
 _STRIPS = 12
+DEMO = "demo"
+# Of a pack that is flown over: 200 MB of texture.
+_MAX_PACK_PX = 64_000_000
 # Of a pack's tiles, bytes in the middle of each file are turned over.
 _DAMAGE_BYTES = 64
 
@@ -72,7 +79,12 @@ def _domain(world: WorldTable, kind: Kind, seed: int | None = None) -> CrossDoma
 
 @lru_cache(maxsize=1)
 def make_grounds(world: WorldTable, kind: Kind) -> Grounds:
-    """The world of a scenario's ``[world]`` as it is when a map of ``kind`` is flown over."""
+    """The world of a scenario's ``[world]`` as it is when a map of ``kind`` is flown over.
+
+    Raises: MapError for a pack that can't be flown over.
+    """
+    if world.pack is not None:
+        return _grounds_of_pack(_pack_path(world.pack), world.light)
     domain = _domain(world, kind)
     place = domain.place
     low = np.array([place.west_m, place.south_m])
@@ -84,6 +96,19 @@ def make_grounds(world: WorldTable, kind: Kind) -> Grounds:
     return Grounds(scene, Placement(place.west_m, place.south_m, site.grid_scale), site, low, ground_m)
 
 
+def _pack_path(pack: str) -> Path:
+    return demo_pack_path() if pack == DEMO else Path(pack)
+
+
+def _grounds_of_pack(path: Path, light: Light) -> Grounds:
+    pack = Pack.open(path)
+    with MapStore(pack, max_pixels=_MAX_PACK_PX) as store:
+        scene, low = scene_of_map(store, None, light)
+    middle = np.array(low) + 0.5 * np.array([scene.spec.width_m, scene.spec.height_m])
+    site = Site(pack.georeference, np.append(middle, scene.spec.ground_m))
+    return Grounds(scene, Placement(*low, site.grid_scale), site, np.array(low), scene.spec.ground_m)
+
+
 # -- the pack ----------------------------------------------------------------
 
 
@@ -93,6 +118,8 @@ def pack_for(scenario: Scenario, folder: Path) -> Path:
     Raises: MapError if it can't be built.
     """
     world, table = scenario.world, scenario.map
+    if world.pack is not None:
+        return _pack_path(world.pack)
     # A damaged pack is a copy of the good one.
     recipe = msgspec.json.encode([_RECIPE, world, msgspec.structs.replace(table, damaged=0.0)])
     name = hashlib.sha256(recipe).hexdigest()[:16]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import html
 import json
 import math
 import os
@@ -28,7 +29,7 @@ from ortholoc_sim.scenario import Expectations, find_scenario, read_scenario, sh
 from ortholoc_sim.stage import Studio, make_grounds
 
 from ortholoc_edge.cli import main
-from ortholoc_edge.errors import ConfigError
+from ortholoc_edge.errors import ConfigError, MapError
 from ortholoc_edge.geometry import frames
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.outcome import Fix
@@ -62,8 +63,9 @@ def test_scenario_comes_out_as_expected(name: str, flight: Flight) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_the_long_form_reads(name: str) -> None:
     long, short = (read_scenario(find_scenario(name), short) for short in (False, True))
-    assert long.world.width_m * long.world.height_m > 1e6
-    assert short.world.width_m < long.world.width_m
+    if long.world.pack is None:
+        assert long.world.width_m * long.world.height_m > 1e6
+        assert short.world.width_m < long.world.width_m
     # A scenario that expects nothing shows nothing.
     assert long.expect != Expectations()
 
@@ -85,6 +87,30 @@ def test_same_scenario_and_seed_same_bytes(flight: Flight, packs: Path, tmp_path
     (printed,) = json.loads(run.stdout)
     assert printed["passed"] is True and printed["scenario"] == "gnss_lost"
     assert "gnss_lost/seed-1/report.html" in (tmp_path / "there" / "index.html").read_text()
+
+
+def test_a_flight_over_a_map_itself_says_so(flight: Flight, tmp_path: Path) -> None:
+    judged = judge(flight("over_a_map"))
+    assert judged.result.notice is not None and "own orthophoto" in judged.result.notice
+    write_page(judged, tmp_path / REPORT)
+    assert judged.result.notice in html.unescape((tmp_path / REPORT).read_text())
+    assert judge(flight("gnss_lost")).result.notice is None
+
+
+def test_over_a_pack_its_size_counts_and_no_other_map(tmp_path: Path, packs: Path) -> None:
+    text = find_scenario("over_a_map").read_text()
+    far = tmp_path / "far.toml"
+    far.write_text(text.replace("[[120, 250], [330, 250]]", "[[120, 250], [3300, 250]]"))
+    with pytest.raises(ConfigError, match=r"waypoint \(3300, 250\) lies outside the ground of 6\d\d x 5\d\d m"):
+        fly(read_scenario(far, short=True), 1, packs)
+    both = tmp_path / "both.toml"
+    both.write_text(text + '\n[map]\nkind = "xDOP"\n')
+    with pytest.raises(ConfigError, match="the map is that pack"):
+        read_scenario(both)
+    gone = tmp_path / "gone.toml"
+    gone.write_text(text.replace('"demo"', f'"{tmp_path}/no_pack"'))
+    with pytest.raises(MapError, match="no_pack"):
+        fly(read_scenario(gone, short=True), 1, packs)
 
 
 def test_another_seed_is_another_flight(packs: Path, flight: Flight) -> None:
