@@ -66,6 +66,25 @@ class Sensor:
     blur_px: float = 0.6
     jpeg_quality: int = 88
 
+    def expose(self, clean: ImageArray, camera: Camera, seed: int) -> ImageArray:
+        """What it makes of a clean picture (H, W, 3) RGB; ``seed`` picks the noise."""
+        image = (
+            cv2.GaussianBlur(clean, (0, 0), self.blur_px).astype(np.float32)
+            if self.blur_px
+            else clean.astype(np.float32)
+        )
+        u = (np.arange(camera.width, dtype=np.float32) - np.float32(camera.cx)) / np.float32(camera.fx)
+        v = (np.arange(camera.height, dtype=np.float32) - np.float32(camera.cy)) / np.float32(camera.fy)
+        r2 = u[None] ** 2 + v[:, None] ** 2
+        image *= (np.float32(self.gain) * (1.0 - np.float32(self.vignetting) * r2 / r2.max()))[..., None]
+        if self.noise:
+            rng = np.random.default_rng([seed, 77])
+            image += np.float32(self.noise) * rng.standard_normal(image.shape, dtype=np.float32)
+        picture: ImageArray = np.clip(image, 0, 255).astype(np.uint8)
+        if self.jpeg_quality:
+            _, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])
+            picture = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR_RGB), dtype=np.uint8)
+        return picture
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
@@ -120,7 +139,7 @@ class Renderer:
 
     def render(self, camera: Camera, map_from_camera: Rigid3, seed: int = 0) -> ImageArray:
         """(H, W, 3) RGB picture; ``seed`` picks its noise."""
-        return self.exposed(self.clean(camera, map_from_camera), camera, seed)
+        return self.sensor.expose(self.clean(camera, map_from_camera), camera, seed)
 
     def clean(self, camera: Camera, map_from_camera: Rigid3) -> ImageArray:
         """(H, W, 3) RGB, without the sensor's flaws."""
@@ -132,7 +151,7 @@ class Renderer:
         shape = (camera.height, camera.width)
         local = np.stack([x, y, z], axis=-1).astype(np.float64).reshape(*shape, 3)
         points = local + np.array([self.placement.west_m, self.placement.south_m, 0.0])
-        return View(self.exposed(clean, camera, seed), points, objects.reshape(shape), facade.reshape(shape))
+        return View(self.sensor.expose(clean, camera, seed), points, objects.reshape(shape), facade.reshape(shape))
 
     def _directions(self, camera: Camera) -> Float32Array:
         if camera not in self._rays:
@@ -286,27 +305,6 @@ class Renderer:
         light = 0.9 * ambient + np.clip(lit, 0.0, 1.1)[:, None] * direct
         paint = np.where(window[:, None], np.array([52, 60, 72], dtype=np.float32), house[:, 8:11])
         colours[at] = np.clip(paint * light, 0, 255).astype(np.uint8)
-
-    def exposed(self, clean: ImageArray, camera: Camera, seed: int) -> ImageArray:
-        """What the sensor makes of a clean picture (H, W, 3)."""
-        sensor = self.sensor
-        image = (
-            cv2.GaussianBlur(clean, (0, 0), sensor.blur_px).astype(np.float32)
-            if sensor.blur_px
-            else clean.astype(np.float32)
-        )
-        u = (np.arange(camera.width, dtype=np.float32) - np.float32(camera.cx)) / np.float32(camera.fx)
-        v = (np.arange(camera.height, dtype=np.float32) - np.float32(camera.cy)) / np.float32(camera.fy)
-        r2 = u[None] ** 2 + v[:, None] ** 2
-        image *= (np.float32(sensor.gain) * (1.0 - np.float32(sensor.vignetting) * r2 / r2.max()))[..., None]
-        if sensor.noise:
-            rng = np.random.default_rng([seed, 77])
-            image += np.float32(sensor.noise) * rng.standard_normal(image.shape, dtype=np.float32)
-        picture: ImageArray = np.clip(image, 0, 255).astype(np.uint8)
-        if sensor.jpeg_quality:
-            _, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, sensor.jpeg_quality])
-            picture = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR_RGB), dtype=np.uint8)
-        return picture
 
 
 @dataclass(frozen=True, slots=True, eq=False)

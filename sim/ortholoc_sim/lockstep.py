@@ -402,12 +402,12 @@ class _Flight:
 
     def _route_map(self) -> FloatArray:
         table = self.scenario.route
-        spec = self._grounds.scene.spec
+        width_m, height_m = self._grounds.size_m
         for east, north in table.waypoints_m:
-            if not (0 <= east <= spec.width_m and 0 <= north <= spec.height_m):
+            if not (0 <= east <= width_m and 0 <= north <= height_m):
                 raise ConfigError(
                     f"scenario {self.scenario.name}: waypoint ({east:g}, {north:g}) lies outside the ground of "
-                    f"{spec.width_m:.0f} x {spec.height_m:.0f} m"
+                    f"{width_m:.0f} x {height_m:.0f} m"
                 )
         xy = rounded(np.array(table.waypoints_m), table.corner_radius_m) + self._grounds.low_m
         return np.column_stack([xy, np.full(len(xy), self._grounds.ground_m + table.height_agl_m)])

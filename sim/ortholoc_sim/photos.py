@@ -24,15 +24,13 @@ from ortholoc_edge.errors import MapError
 from ortholoc_edge.geometry import frames, rotation
 from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
 from ortholoc_edge.geometry.camera import Camera
-from ortholoc_edge.geometry.grid import RasterGrid
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.tiles.georeference import Georeference
 from ortholoc_edge.tiles.manifest import layer_bounds
 from ortholoc_edge.tiles.pack import Pack
 from ortholoc_sim.camera import Placement, Renderer, Sensor
 from ortholoc_sim.country import FLIGHT, Country, Look
-from ortholoc_sim.epoch import FLIGHT as LIGHT
-from ortholoc_sim.world import Scene, WorldSpec
+from ortholoc_sim.wide import country_scene
 
 CAMERA = Camera.from_focal(640, 480, 540.0)
 # Of a flight's table (docs/sequences.md).
@@ -73,13 +71,8 @@ def photograph(
     points = np.concatenate([outline, eye[None, :2]])
     west, south = np.floor(points.min(axis=0) - _MARGIN_M)
     east, north = np.ceil(points.max(axis=0) + _MARGIN_M)
-    columns, rows = round((east - west) / _TEXEL_M), round((north - south) / _TEXEL_M)
-    grid = RasterGrid(columns, rows, west, south + rows * _TEXEL_M, _TEXEL_M, -_TEXEL_M)
-    rgb, heights = country.rgb(grid, crs, look), country.heights(grid, crs, look)
-    spec = WorldSpec(0, columns * _TEXEL_M, rows * _TEXEL_M, _TEXEL_M)
-    # Light and shade are in the country's colours; the epoch only lights façades, and no object here has one.
-    scene = Scene(spec, LIGHT, rgb, heights, heights, np.zeros((rows, columns), np.uint16), (), (), ())
-    renderer = Renderer(scene, Placement(west, south, grid_scale), Sensor())
+    scene, corner = country_scene(country, crs, look, (west, south, east, north), _TEXEL_M)
+    renderer = Renderer(scene, Placement(*corner, grid_scale), Sensor())
     return renderer.render(camera, map_from_camera, seed)
 
 

@@ -29,6 +29,7 @@ from ortholoc_sim.recorded import Light
 
 _NO_LINE = "udpout:127.0.0.1:1"
 SHORT = "short"
+_MOST_M, _MOST_WHOLE_M = 10_000.0, 3000.0
 
 Positive = Annotated[float, Meta(gt=0)]
 Pair = tuple[float, float]
@@ -41,14 +42,25 @@ class WorldTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         pack: folder of an area pack with a reference system and heights above sea level, or "demo", the shipped one.
             The camera sees its own orthophoto over its own surface model, in another ``light`` (`recorded`); the sizes
             and the seed are then of no use.
+        kind: "place", with façades, markings and cars, drawn whole; or "country": plainer, without end, drawn where it
+            is flown over, for areas up to 100 km2.
     """
+
+    kind: Literal["place", "country"] = "place"
 
     pack: str | None = None
     light: Light = field(default_factory=Light)
     seed: Annotated[int, Meta(ge=0)] = 1
-    width_m: Annotated[float, Meta(ge=200, le=3000)] = 1200.0
-    height_m: Annotated[float, Meta(ge=200, le=3000)] = 1000.0
+    width_m: Annotated[float, Meta(ge=200, le=_MOST_M)] = 1200.0
+    height_m: Annotated[float, Meta(ge=200, le=_MOST_M)] = 1000.0
     gsd_m: Annotated[float, Meta(ge=0.05, le=1)] = 0.25
+
+    def __post_init__(self) -> None:
+        if self.kind == "place" and max(self.width_m, self.height_m) > _MOST_WHOLE_M:
+            raise ValueError(
+                f"{self.width_m:g} x {self.height_m:g} m of a place, which is drawn whole: at most {_MOST_WHOLE_M:g} m "
+                'each; kind = "country" goes up to 100 km2'
+            )
 
 
 class MapTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -297,6 +309,8 @@ class Scenario(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             if self.map != MapTable():
                 raise ValueError("[map] is of generated worlds; over [world] pack the map is that pack")
             return
+        if self.world.kind == "country" and self.map != MapTable(kind=self.map.kind, damaged=self.map.damaged):
+            raise ValueError('over a world of kind "country" only [map] kind and damaged can be set')
         for east, north in self.route.waypoints_m:
             if not (0 <= east <= self.world.width_m and 0 <= north <= self.world.height_m):
                 raise ValueError(

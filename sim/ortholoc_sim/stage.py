@@ -10,7 +10,8 @@ import hashlib
 import logging
 import shutil
 import tempfile
-from collections.abc import Callable, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -20,6 +21,7 @@ import msgspec
 import numpy as np
 import rasterio
 from rasterio.transform import Affine
+from rasterio.windows import Window
 
 from ortholoc_edge.geometry.arrays import Float32Array, FloatArray, ImageArray
 from ortholoc_edge.geometry.camera import Camera
@@ -32,12 +34,13 @@ from ortholoc_edge.tiles.store import MapStore
 from ortholoc_edge.tiles.vertical import derive_offsets
 from ortholoc_sim import demo_pack_path
 from ortholoc_sim.camera import Placement, Renderer, Sensor
-from ortholoc_sim.country import FRAME
-from ortholoc_sim.crossdomain import CrossDomain, Kind, MapLayers
+from ortholoc_sim.country import CENTRE, FLIGHT, FRAME, SURVEYS, Country, Look
+from ortholoc_sim.crossdomain import DOP_GSD_M, DSM_GSD_M, CrossDomain, Kind, MapLayers
 from ortholoc_sim.noise import blobs
 from ortholoc_sim.recorded import Light, scene_of_map
 from ortholoc_sim.scenario import CameraTable, MapTable, Scenario, WorldTable
 from ortholoc_sim.site import Site
+from ortholoc_sim.wide import WideRenderer, country_scene
 from ortholoc_sim.world import Scene
 
 logger = logging.getLogger(__name__)
@@ -48,7 +51,16 @@ UNDULATION_M = 47.3
 _DSM_SIGMA_M = {Kind.SAME: 0.1, Kind.XDOP: 0.1, Kind.XDOPDSM: 0.4}
 _DOP_SIGMA_M = 0.05
 _STRIPS = 12
+# Of the country: when its DOP and DSM were taken.
+_COUNTRY_LOOKS: dict[Kind, tuple[Look, Look]] = {
+    Kind.SAME: (FLIGHT, FLIGHT),
+    Kind.XDOP: (SURVEYS[2023], FLIGHT),
+    Kind.XDOPDSM: (SURVEYS[2021], SURVEYS[2021]),
+}
 DEMO = "demo"
+_SOME_M = 600.0
+# A country's rasters are written in squares of so many pixels.
+_BLOCK_PX = 2048
 # Of a pack that is flown over: 200 MB of texture.
 _MAX_PACK_PX = 64_000_000
 # Of a pack's tiles, bytes in the middle of each file are turned over.
@@ -56,21 +68,61 @@ _DAMAGE_BYTES = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Grounds:
+class Grounds(ABC):
     """A world at the time of the flight.
 
     Attributes:
-        scene, placement: for the renderer.
         site: its frames; by the true datum, whatever the pack says.
-        low_m: (2,) its south-west corner in the map.
+        low_m, size_m: (2,) its south-west corner in the map, and how far it reaches from there.
         ground_m: typical height of its ground.
     """
 
-    scene: Scene
-    placement: Placement
     site: Site
     low_m: FloatArray
+    size_m: FloatArray
     ground_m: float
+
+    @abstractmethod
+    def renderer(self, sensor: Sensor, level_by_pixel: bool) -> Renderer | WideRenderer:
+        """For a camera over it."""
+
+    @abstractmethod
+    def some(self) -> tuple[Scene, Placement]:
+        """A part of it, of which others are made."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneGrounds(Grounds):
+    """Those that are drawn whole."""
+
+    scene: Scene
+    placement: Placement
+
+    def renderer(self, sensor: Sensor, level_by_pixel: bool) -> Renderer | WideRenderer:
+        return Renderer(self.scene, self.placement, sensor, level_by_pixel=level_by_pixel)
+
+    def some(self) -> tuple[Scene, Placement]:
+        return self.scene, self.placement
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CountryGrounds(Grounds):
+    """A rectangle of the endless country, drawn where it is flown over."""
+
+    country: Country
+    texel_m: float
+
+    def renderer(self, sensor: Sensor, level_by_pixel: bool) -> Renderer | WideRenderer:
+        return WideRenderer(
+            self.country, FRAME, FLIGHT, sensor, ground_m=self.ground_m, grid_scale=self.site.grid_scale,
+            texel_m=self.texel_m, level_by_pixel=level_by_pixel,
+        )  # fmt: skip
+
+    def some(self) -> tuple[Scene, Placement]:
+        low = self.low_m + 0.5 * self.size_m - _SOME_M / 2
+        bounds = (float(low[0]), float(low[1]), float(low[0]) + _SOME_M, float(low[1]) + _SOME_M)
+        scene, corner = country_scene(self.country, FRAME, FLIGHT, bounds, self.texel_m)
+        return scene, Placement(*corner, self.site.grid_scale)
 
 
 def _domain(world: WorldTable, kind: Kind, seed: int | None = None) -> CrossDomain:
@@ -85,15 +137,23 @@ def make_grounds(world: WorldTable, kind: Kind) -> Grounds:
     """
     if world.pack is not None:
         return _grounds_of_pack(_pack_path(world.pack), world.light)
+    if world.kind == "country":
+        return _grounds_of_country(world)
     domain = _domain(world, kind)
     place = domain.place
     low = np.array([place.west_m, place.south_m])
     middle = low + 0.5 * np.array([world.width_m, world.height_m])
     ground_m = float(np.median(place.world.terrain))
+    site = _site(middle, ground_m)
+    return SceneGrounds(
+        site, low, np.array([world.width_m, world.height_m]), ground_m, domain.flight_scene(),
+        Placement(place.west_m, place.south_m, site.grid_scale),
+    )  # fmt: skip
+
+
+def _site(middle: FloatArray, ground_m: float) -> Site:
     vertical = derive_offsets("ellipsoid", None, UNDULATION_M, None)[0]
-    site = Site(Georeference(FRAME, vertical, (float(middle[0]), float(middle[1]))), np.append(middle, ground_m))
-    scene = domain.flight_scene()
-    return Grounds(scene, Placement(place.west_m, place.south_m, site.grid_scale), site, low, ground_m)
+    return Site(Georeference(FRAME, vertical, (float(middle[0]), float(middle[1]))), np.append(middle, ground_m))
 
 
 def _pack_path(pack: str) -> Path:
@@ -106,7 +166,23 @@ def _grounds_of_pack(path: Path, light: Light) -> Grounds:
         scene, low = scene_of_map(store, None, light)
     middle = np.array(low) + 0.5 * np.array([scene.spec.width_m, scene.spec.height_m])
     site = Site(pack.georeference, np.append(middle, scene.spec.ground_m))
-    return Grounds(scene, Placement(*low, site.grid_scale), site, np.array(low), scene.spec.ground_m)
+    size = np.array([scene.spec.width_m, scene.spec.height_m])
+    return SceneGrounds(
+        site, np.array(low), size, scene.spec.ground_m, scene, Placement(*low, site.grid_scale)
+    )
+
+
+def _grounds_of_country(world: WorldTable) -> Grounds:
+    country, low, size = Country(world.seed), _country_low(world), np.array([world.width_m, world.height_m])
+    rng = np.random.default_rng([world.seed, 64])
+    east, north = (low + rng.uniform(0.0, 1.0, (60, 2)) * size).T
+    ground_m = float(np.median(country.height(east, north, FLIGHT)))
+    return CountryGrounds(_site(low + 0.5 * size, ground_m), low, size, ground_m, country, world.gsd_m)
+
+
+def _country_low(world: WorldTable) -> FloatArray:
+    """Around the place where the country has something of everything."""
+    return np.asarray(np.array(CENTRE) - 0.5 * np.array([world.width_m, world.height_m]), dtype=np.float64)
 
 
 # -- the pack ----------------------------------------------------------------
@@ -143,6 +219,20 @@ def _layers(world: WorldTable, kind: Kind, seed: int | None) -> MapLayers:
 
 
 def _build(world: WorldTable, table: MapTable, out: Path) -> None:
+    options = PackOptions(
+        quality=80, vertical="ellipsoid", geoid_undulation_m=UNDULATION_M,
+        attribution="generated by ortholoc_sim, not a real place", licence="CC0-1.0", true_ortho=True,
+        dop_sigma_m=_DOP_SIGMA_M, dsm_sigma_m=_DSM_SIGMA_M[table.kind], max_hole_cells=0,
+    )  # fmt: skip
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=out.parent) as scratch:
+        dop_path, dsm_path = Path(scratch) / "dop.tif", Path(scratch) / "dsm.tif"
+        write = _write_country if world.kind == "country" else _write_place
+        write(world, table, dop_path, dsm_path)
+        _put_whole(out, lambda target: build_pack(dop_path, dsm_path, target, options))
+
+
+def _write_place(world: WorldTable, table: MapTable, dop_path: Path, dsm_path: Path) -> None:
     layers = _layers(world, table.kind, table.world_seed)
     dop, dsm = layers.dop, layers.dsm + np.float32(table.height_error_m)
     if table.mirrored:
@@ -152,25 +242,56 @@ def _build(world: WorldTable, table: MapTable, out: Path) -> None:
         grid = layers.dsm_grid
         rows = slice(max(0, round((world.height_m - north) / -grid.dy)), round((world.height_m - south) / -grid.dy))
         dsm[rows, max(0, round(west / grid.dx)) : round(east / grid.dx)] = np.nan
-    options = PackOptions(
-        quality=80, vertical="ellipsoid", geoid_undulation_m=UNDULATION_M,
-        attribution="generated by ortholoc_sim, not a real place", licence="CC0-1.0", true_ortho=True,
-        dop_sigma_m=_DOP_SIGMA_M, dsm_sigma_m=_DSM_SIGMA_M[table.kind], max_hole_cells=0,
-    )  # fmt: skip
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=out.parent) as scratch:
-        dop_path, dsm_path = Path(scratch) / "dop.tif", Path(scratch) / "dsm.tif"
-        _write(dop_path, np.moveaxis(dop, 2, 0), layers.dop_grid, photometric="RGB")
-        _write(dsm_path, dsm[None], layers.dsm_grid, nodata=np.nan)
-        _put_whole(out, lambda target: build_pack(dop_path, dsm_path, target, options))
+    _write(dop_path, layers.dop_grid, [(0, 0, np.moveaxis(dop, 2, 0))], photometric="RGB")
+    _write(dsm_path, layers.dsm_grid, [(0, 0, dsm[None])], nodata=np.nan)
 
 
-def _write(path: Path, bands: ImageArray | Float32Array, grid: RasterGrid, **options: object) -> None:
-    with rasterio.open(
-        path, "w", driver="GTiff", count=len(bands), dtype=bands.dtype.name, width=grid.width, height=grid.height,
-        crs=FRAME, transform=Affine(grid.dx, 0.0, grid.west, 0.0, grid.dy, grid.top), **options,
-    ) as target:  # fmt: skip
-        target.write(bands)
+def _write_country(world: WorldTable, table: MapTable, dop_path: Path, dsm_path: Path) -> None:
+    """Square by square: of 100 km2 there is never more than one in memory."""
+    country, low = Country(world.seed), _country_low(world)
+    dop_look, dsm_look = _COUNTRY_LOOKS[table.kind]
+
+    def grid(gsd_m: float) -> RasterGrid:
+        columns, rows = round(world.width_m / gsd_m), round(world.height_m / gsd_m)
+        return RasterGrid(columns, rows, float(low[0]), float(low[1]) + rows * gsd_m, gsd_m, -gsd_m)
+
+    dop, dsm = grid(DOP_GSD_M), grid(DSM_GSD_M)
+    pictures = (
+        (row, column, np.moveaxis(country.rgb(block, FRAME, dop_look), 2, 0)) for row, column, block in _blocks(dop)
+    )
+    _write(dop_path, dop, pictures, photometric="RGB")
+    heights = ((row, column, country.heights(block, FRAME, dsm_look)[None]) for row, column, block in _blocks(dsm))
+    _write(dsm_path, dsm, heights, nodata=np.nan)
+
+
+def _blocks(grid: RasterGrid) -> Iterator[tuple[int, int, RasterGrid]]:
+    """Row and column of a grid's squares, and their grids."""
+    for row in range(0, grid.height, _BLOCK_PX):
+        for column in range(0, grid.width, _BLOCK_PX):
+            size = min(_BLOCK_PX, grid.width - column), min(_BLOCK_PX, grid.height - row)
+            yield row, column, grid.crop(column, row, *size)
+
+
+def _write(
+    path: Path,
+    grid: RasterGrid,
+    parts: Iterable[tuple[int, int, ImageArray | Float32Array]],
+    **options: object,
+) -> None:
+    """``parts``: row, column and (bands, h, w) of what is written there."""
+    target = None
+    try:
+        for row, column, bands in parts:
+            if target is None:
+                target = rasterio.open(
+                    path, "w", driver="GTiff", count=len(bands), dtype=bands.dtype.name, width=grid.width,
+                    height=grid.height, crs=FRAME, transform=Affine(grid.dx, 0.0, grid.west, 0.0, grid.dy, grid.top),
+                    tiled=True, **options,
+                )  # fmt: skip
+            target.write(bands, window=Window(column, row, bands.shape[2], bands.shape[1]))
+    finally:
+        if target is not None:
+            target.close()
 
 
 def _put_whole(out: Path, make: Callable[[Path], object]) -> None:
@@ -208,7 +329,8 @@ class Studio:
         self.camera = table.intrinsics().camera()
         self._table, self._grounds = table, grounds
         sensor = Sensor(table.gain, table.vignetting, table.noise, table.blur_px, table.jpeg_quality)
-        self._renderer = Renderer(grounds.scene, grounds.placement, sensor, level_by_pixel=table.readout_ms > 0)
+        self._sensor = sensor
+        self._renderer = grounds.renderer(sensor, level_by_pixel=table.readout_ms > 0)
         self._water: Renderer | None = None
 
     def row_times_ms(self) -> list[float]:
@@ -231,7 +353,8 @@ class Studio:
     def of_water(self, poses: Sequence[Rigid3], seed: int) -> ImageArray:
         """The same with nothing but water below: waves, that are elsewhere in every picture."""
         if self._water is None:
-            self._water = Renderer(flooded(self._grounds.scene), self._grounds.placement, self._renderer.sensor)
+            scene, placement = self._grounds.some()
+            self._water = Renderer(flooded(scene), placement, self._sensor)
         middle = poses[len(poses) // 2]
         drift = np.random.default_rng([seed, 62]).uniform(-40.0, 40.0, 2)
         moved = Rigid3(middle.rotation, middle.translation + np.append(drift, 0.0))
@@ -244,7 +367,7 @@ class Studio:
         return np.clip(2.0 + noise, 0, 255).astype(np.uint8)
 
     def _taken(
-        self, renderer: Renderer, poses: Sequence[Rigid3], smear: tuple[Rigid3, Rigid3] | None, seed: int
+        self, renderer: Renderer | WideRenderer, poses: Sequence[Rigid3], smear: tuple[Rigid3, Rigid3] | None, seed: int
     ) -> ImageArray:
         if len(poses) == 1:
             clean = renderer.clean(self.camera, poses[0])
@@ -257,7 +380,7 @@ class Studio:
             clean = np.concatenate(strips)
         if smear is not None:
             clean = self._smeared(clean, *smear)
-        return renderer.exposed(clean, self.camera, seed)
+        return self._sensor.expose(clean, self.camera, seed)
 
     def _smeared(self, clean: ImageArray, begin: Rigid3, end: Rigid3) -> ImageArray:
         """Along the way that the picture's middle goes during the exposure."""
