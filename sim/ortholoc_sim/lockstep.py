@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import rasterio
 
 from ortholoc_edge.adapters.camera import CameraOptions
 from ortholoc_edge.adapters.mavlink.codec import FrameParser, dialect
@@ -313,6 +314,11 @@ class _Flight:
         return self._camera_pose(truth, stamp_ns)
 
     def run(self, progress: Callable[[float], None]) -> Flown:
+        # One environment of rasterio's for all steps: see `ClosedLoop.advance`.
+        with rasterio.Env():
+            return self._run(progress)
+
+    def _run(self, progress: Callable[[float], None]) -> Flown:
         began = time.monotonic()
         daemon = Daemon(self._config(), frames=_NoFrames(), clock=self._clock)
         try:

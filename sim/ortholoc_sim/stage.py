@@ -58,7 +58,7 @@ _COUNTRY_LOOKS: dict[Kind, tuple[Look, Look]] = {
     Kind.XDOPDSM: (SURVEYS[2021], SURVEYS[2021]),
 }
 DEMO = "demo"
-_SOME_M = 600.0
+_SOME_M, _COARSE_M = 600.0, 2.0
 # A country's rasters are written in squares of so many pixels.
 _BLOCK_PX = 2048
 # Of a pack that is flown over: 200 MB of texture.
@@ -174,9 +174,11 @@ def _grounds_of_pack(path: Path, light: Light) -> Grounds:
 
 def _grounds_of_country(world: WorldTable) -> Grounds:
     country, low, size = Country(world.seed), _country_low(world), np.array([world.width_m, world.height_m])
-    rng = np.random.default_rng([world.seed, 64])
-    east, north = (low + rng.uniform(0.0, 1.0, (60, 2)) * size).T
-    ground_m = float(np.median(country.height(east, north, FLIGHT)))
+    reach = np.minimum(size, _SOME_M)
+    west, south = low + 0.5 * (size - reach)
+    columns, rows = (round(float(side) / _COARSE_M) for side in reach)
+    coarse = RasterGrid(columns, rows, float(west), float(south) + rows * _COARSE_M, _COARSE_M, -_COARSE_M)
+    ground_m = float(np.median(country.heights(coarse, FRAME, FLIGHT)))
     return CountryGrounds(_site(low + 0.5 * size, ground_m), low, size, ground_m, country, world.gsd_m)
 
 
