@@ -66,6 +66,10 @@ def run(args: argparse.Namespace) -> int:
         return sim_scenarios.list_scenarios()
     if args.scenario:
         return sim_scenarios.fly_scenarios(args)
+    for option, given in (("--short", args.short), ("--without-fixes", args.without_fixes), ("--seeds", args.seeds > 1),
+                          ("--packs", args.packs is not None)):  # fmt: skip
+        if given:
+            raise ConfigError(f"{option} is of scenarios; name one with --scenario, or leave it out")
     # Not at the top: every other command works without the simulation.
     from ortholoc_sim import demo_pack_path
     from ortholoc_sim.autopilot import AutopilotOptions, FilterOptions

@@ -7,16 +7,18 @@ import html
 import json
 import logging
 import sys
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+from urllib.parse import quote
 
 import msgspec
 from tqdm import tqdm
 
 from ortholoc_edge.cli.arguments import positive_int, writable_folder
 from ortholoc_edge.cli.measured import provenance
-from ortholoc_edge.errors import OrtholocError
+from ortholoc_edge.errors import ConfigError, OrtholocError
 
 if TYPE_CHECKING:
     from ortholoc_sim.judgement import Result
@@ -69,7 +71,7 @@ def list_scenarios() -> int:
 
 def fly_scenarios(args: argparse.Namespace) -> int:
     """Fly what ``--scenario`` names, with every seed; write results and reports below ``--out``."""
-    from ortholoc_sim.judgement import judge, times, write_files
+    from ortholoc_sim.judgement import figures, judge, times, write_files
     from ortholoc_sim.lockstep import fly
     from ortholoc_sim.report_page import write_page
 
@@ -97,11 +99,12 @@ def fly_scenarios(args: argparse.Namespace) -> int:
             write_files(judged, folder)
             write_page(judged, folder / "report.html")
             flights.append((judged.result, folder))
+            # After each: what ends the next one leaves what was flown.
+            _write_summary(args.out, flights)
             if not args.json:
                 print(_row(judged.result, times(flown)["wall_s"]), flush=True)
-    _write_summary(args.out, flights)
     if args.json:
-        print(json.dumps([msgspec.to_builtins(result) for result, _ in flights]))
+        print(json.dumps([figures(result) for result, _ in flights]))
     else:
         print("\n".join(["", *_totals([result for result, _ in flights], args.out)]))
     return 0 if all(result.passed for result, _ in flights) else 1
@@ -114,6 +117,11 @@ def _chosen(args: argparse.Namespace) -> list[Scenario]:
     for name in args.scenario:
         names += [other for other in (shipped() if name == ALL else [name]) if other not in names]
     scenarios = [read_scenario(find_scenario(name), args.short) for name in names]
+    twice = [name for name, count in Counter(one.name for one in scenarios).items() if count > 1]
+    if twice:
+        raise ConfigError(
+            f"several scenarios are named {twice[0]}, and would write to the same folder; rename one of the files"
+        )
     if args.without_fixes:
         scenarios = [msgspec.structs.replace(one, fixes=False, expect=Expectations()) for one in scenarios]
     # Those over the same ground together: it is made once.
@@ -121,8 +129,10 @@ def _chosen(args: argparse.Namespace) -> list[Scenario]:
 
 
 def _write_summary(out: Path, flights: Sequence[tuple[Result, Path]]) -> None:
+    from ortholoc_sim.judgement import figures
+
     links = "".join(
-        f'<tr><td><a href="{html.escape(folder.relative_to(out).as_posix())}/report.html">'
+        f'<tr><td><a href="./{quote(folder.relative_to(out).as_posix())}/report.html">'
         f"{html.escape(result.scenario)}</a></td><td>{result.seed}</td><td>{html.escape(result.title)}</td>"
         f"<td>{'as expected' if result.passed else html.escape('; '.join(result.problems))}</td></tr>"
         for result, folder in flights
@@ -132,10 +142,10 @@ def _write_summary(out: Path, flights: Sequence[tuple[Result, Path]]) -> None:
         "<style>body{font:15px system-ui,sans-serif;margin:24px}td{padding:2px 14px 2px 0}</style></head>"
         f"<body><h1>Simulated flights</h1><table>{links}</table></body></html>\n"
     )
-    figures: list[Any] = [msgspec.to_builtins(result) for result, _ in flights]
+    every = [figures(result) for result, _ in flights]
     try:
         (out / "index.html").write_text(page, encoding="utf-8")
-        (out / "summary.json").write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+        (out / "summary.json").write_text(json.dumps(every, indent=2) + "\n", encoding="utf-8")
     except OSError as err:
         raise OrtholocError(f"{out}: can't write the summary ({err})") from err
 

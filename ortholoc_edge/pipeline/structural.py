@@ -318,7 +318,7 @@ class Tracking:
         a search; None if there is none.
 
         Args:
-            proceed: asked before the search and each of its starts; False ends it.
+            proceed: asked before the search, each of its starts and the second look at them; False ends it.
             start: the frame's pose as something else has found it, in the map's coordinates: only that is followed. The
                 prediction stays what the outcome is measured by.
         """
@@ -372,18 +372,17 @@ class Tracking:
         """The same from all starts, each drawn anew before its shift is looked for: a peak far from the prediction is
         of a view that had little in common with the frame, and its place is but roughly right. Only those that fit best
         at the first level get to the second."""
-        firsts = []
-        for start in starts:
-            if not proceed():
-                break
-            step = self._level(0, start, self._predicted, look_wide=True)
-            if step is not None:
-                firsts.append(step)
-        firsts.sort(key=lambda step: -float(step.scores[step.inliers].sum()))
+        if not starts or not proceed():
+            return None
+        drawn = (self._level(0, start, self._predicted, look_wide=True) for start in starts)
+        firsts = sorted(
+            (step for step in drawn if step is not None), key=lambda step: -float(step.scores[step.inliers].sum())
+        )
         best: list[_Step] | None = None
         seen: list[Rigid3] = []
         for step in firsts:
-            if len(seen) == _LOOKED_AT_AGAIN or not proceed():
+            # Not asked again: to draw them all and then to follow none would be time for nothing.
+            if len(seen) == _LOOKED_AT_AGAIN:
                 break
             if any(self._alike(step.pose, other) for other in seen):
                 continue

@@ -24,6 +24,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ortholoc_edge.cli.arguments import non_negative, positive, seed
 from ortholoc_edge.clock import Clock, SystemClock
 from ortholoc_edge.errors import ConfigError, OrtholocError
 from ortholoc_edge.geometry.arrays import FloatArray
@@ -402,23 +403,25 @@ def _arguments() -> argparse.ArgumentParser:
     over.add_argument("--tcp", metavar="[HOST:]PORT", help="serve one companion at a time")
     over.add_argument("--pty", action="store_true", help="a pseudo-terminal, whose name is told")
     line = parser.add_argument_group("the line between")
-    line.add_argument("--baud", type=int, default=0, metavar="N", help="of a serial line; 0 is infinitely fast")
-    line.add_argument("--delay-ms", type=float, default=0.0, metavar="MS")
-    line.add_argument("--jitter-ms", type=float, default=0.0, metavar="MS")
-    line.add_argument("--loss", type=float, default=0.0, metavar="P", help="probability that a frame is lost")
-    line.add_argument("--corruption", type=float, default=0.0, metavar="P", help="probability of a wrong bit, per byte")
+    line.add_argument("--baud", type=_whole, default=0, metavar="N", help="of a serial line; 0 is infinitely fast")
+    line.add_argument("--delay-ms", type=non_negative, default=0.0, metavar="MS")
+    line.add_argument("--jitter-ms", type=non_negative, default=0.0, metavar="MS")
+    line.add_argument("--loss", type=_probability, default=0.0, metavar="P", help="probability that a frame is lost")
+    line.add_argument(
+        "--corruption", type=_probability, default=0.0, metavar="P", help="probability of a wrong bit, per byte"
+    )
     flight = parser.add_argument_group("the flight")
     flight.add_argument("--home", metavar="LAT,LON,AMSL", help="default: 48.8026,11.0033,382.7")
     flight.add_argument("--route", default="circle", metavar="FILE|circle", help="a QGC WPL 110 file, or around home")
     flight.add_argument("--airframe", choices=("multirotor", "fixed-wing"), default="multirotor")
-    flight.add_argument("--speed", type=float, metavar="M/S", help="over ground (9, a fixed wing 18)")
+    flight.add_argument("--speed", type=positive, metavar="M/S", help="over ground (9, a fixed wing 18)")
     flight.add_argument("--wind", default="1.5,-1", metavar="N,E", help="m/s that the air moves north and east")
-    flight.add_argument("--gnss-loss-at", type=float, metavar="S")
-    flight.add_argument("--gnss-back-at", type=float, metavar="S")
+    flight.add_argument("--gnss-loss-at", type=non_negative, metavar="S")
+    flight.add_argument("--gnss-back-at", type=non_negative, metavar="S")
     flight.add_argument("--spoof", metavar="M/S[,DEG]", help="GNSS walks away at this speed, in this direction (90)")
-    flight.add_argument("--spoof-at", type=float, default=30.0, metavar="S")
-    flight.add_argument("--reboot-at", type=float, metavar="S", help="restart the autopilot in flight")
-    flight.add_argument("--duration", type=float, metavar="S", help="end by itself")
+    flight.add_argument("--spoof-at", type=non_negative, metavar="S", help="(30)")
+    flight.add_argument("--reboot-at", type=non_negative, metavar="S", help="restart the autopilot in flight")
+    flight.add_argument("--duration", type=positive, metavar="S", help="end by itself")
     pilot = parser.add_argument_group("the autopilot")
     pilot.add_argument("--stock", action="store_true", help="parameters from the factory, not set up for vision")
     pilot.add_argument("--param", action="append", default=[], metavar="NAME=VALUE")
@@ -426,10 +429,32 @@ def _arguments() -> argparse.ArgumentParser:
     pilot.add_argument("--no-origin", action="store_true", help="without GNSS from the start: it waits for an origin")
     pilot.add_argument("--stamps", choices=("firmware", "ideal"), default="firmware")
     pilot.add_argument("--streams", action="store_true", help="send the usual messages unasked")
-    pilot.add_argument("--system-id", type=int, default=1, metavar="N")
-    parser.add_argument("--seed", type=int, default=1)
+    pilot.add_argument("--system-id", type=_system_id, default=1, metavar="N")
+    parser.add_argument("--seed", type=seed, default=1)
     parser.add_argument("--json", action="store_true", help="one JSON object a line")
     return parser
+
+
+def _whole(text: str) -> int:
+    return int(_within(text, "a whole number", int, 0, 10_000_000))
+
+
+def _system_id(text: str) -> int:
+    return int(_within(text, "a system id", int, 1, 255))
+
+
+def _probability(text: str) -> float:
+    return _within(text, "a probability", float, 0.0, 1.0)
+
+
+def _within(text: str, what: str, kind: Callable[[str], float], least: float, most: float) -> float:
+    try:
+        value = kind(text)
+    except ValueError:
+        value = math.nan
+    if not least <= value <= most:
+        raise argparse.ArgumentTypeError(f"{text!r} is not {what} from {least:g} to {most:g}")
+    return value
 
 
 def _numbers(text: str, what: str, least: int, most: int) -> list[float]:
@@ -450,6 +475,10 @@ def _address(text: str) -> tuple[str, int]:
 
 
 def _events(args: argparse.Namespace) -> tuple[GnssEvent, ...]:
+    if args.gnss_back_at is not None and args.gnss_loss_at is None:
+        raise ConfigError("--gnss-back-at goes with --gnss-loss-at: GNSS has to be lost before it comes back")
+    if args.spoof_at is not None and args.spoof is None:
+        raise ConfigError("--spoof-at goes with --spoof, which says how fast GNSS walks away")
     events = []
     if args.no_origin:
         events.append(GnssEvent(kind="lost", from_s=0.0))
@@ -457,8 +486,9 @@ def _events(args: argparse.Namespace) -> tuple[GnssEvent, ...]:
         events.append(GnssEvent(kind="lost", from_s=args.gnss_loss_at, until_s=args.gnss_back_at))
     if args.spoof is not None:
         rate, *towards = _numbers(args.spoof, "--spoof", 1, 2)
+        from_s = 30.0 if args.spoof_at is None else args.spoof_at
         events.append(
-            GnssEvent(kind="spoofed", from_s=args.spoof_at, rate_m_s=rate, towards_deg=towards[0] if towards else 90.0)
+            GnssEvent(kind="spoofed", from_s=from_s, rate_m_s=rate, towards_deg=towards[0] if towards else 90.0)
         )
     return tuple(events)
 

@@ -47,6 +47,7 @@ _MS = 1_000_000
 START_NS = 5_000 * _S
 # The companion finds the autopilot and its time first.
 _FIRST_FRAME_NS = 2_500 * _MS
+_ONCE = ("clock_steps", "autopilot_reboots")
 _NEVER_S = 1_000_000.0
 # A frame that is refused before anything is matched.
 _REFUSED_MS = 3.0
@@ -326,10 +327,10 @@ class _Flight:
             camera = _Camera(self, Studio(self._grounds, self.scenario.camera))
             worker = _Worker(self, daemon, self.scenario.latency)
             end_ns = START_NS + round(self.duration_s * _S)
-            stepped: set[Fault] = set()
+            happened: set[int] = set()
             while self._loop.now_ns < end_ns and not self._arrived():
                 now_ns = self._loop.now_ns + STEP_NS
-                self._apply_faults(now_ns, stepped)
+                self._apply_faults(now_ns, happened)
                 # What arrives meanwhile first: the line keeps the order in which it is handed frames.
                 self._carry(daemon, now_ns)
                 for message in self._loop.advance(now_ns):
@@ -390,15 +391,15 @@ class _Flight:
         else:
             self._said.append(((now_ns - START_NS) / _S, text))
 
-    def _apply_faults(self, now_ns: int, stepped: set[Fault]) -> None:
+    def _apply_faults(self, now_ns: int, happened: set[int]) -> None:
         down = self.fault("line_down", now_ns) is not None
         self._line.down[End.AUTOPILOT] = down
         self._line.down[End.COMPANION] = down or self.fault("autopilot_mute", now_ns) is not None
-        for kind in ("clock_steps", "autopilot_reboots"):
-            once = self.fault(kind, now_ns)
-            if once is None or once in stepped:
+        # Two of a kind may follow each other, and may be alike.
+        for number, once in enumerate(self.scenario.fault):
+            if once.kind not in _ONCE or number in happened or not once.holds((now_ns - START_NS) / _S):
                 continue
-            stepped.add(once)
+            happened.add(number)
             if once.amount is not None:
                 self._loop.step_clock(round(once.amount * _MS))
             else:

@@ -82,6 +82,7 @@ def _head(judged: Judged) -> str:
         f"{r.nees.pose:.2f} (position {r.nees.position:.2f}, attitude {r.nees.attitude:.2f}); 1 is honest"
     )  # fmt: skip
     rejected = ", ".join(f"{reason} {count}" for reason, count in r.rejections.items()) or "none"
+    route_p95 = "-" if r.route_p95_m is None else f"95 % within {r.route_p95_m:.2f} m; {_spread(r.route_m, 'm')}"
     rows = [
         (
             "flight",
@@ -92,7 +93,7 @@ def _head(judged: Judged) -> str:
         ("false fixes", f"{r.false_fixes}"),
         ("fix error", f"{_spread(r.position_m, 'm')}; {_spread(r.attitude_deg, '°')}"),
         ("NEES / degrees of freedom", nees),
-        ("off the route, by truth", f"95 % within {r.route_p95_m:.2f} m; {_spread(r.route_m, 'm')}"),
+        ("off the route, by truth", route_p95),
         ("autopilot's error", f"{_spread(r.autopilot_m, 'm')}; {r.autopilot_end_m:.1f} m at the end"),
         ("dead reckoning alone", "-" if r.dead_reckoning_m is None else f"{r.dead_reckoning_m:.1f} m off at the end"),
         ("autopilot's filter", ", ".join(f"{verdict} {n}" for verdict, n in r.verdicts.items()) or "received nothing"),

@@ -304,6 +304,8 @@ class Scenario(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
                 f"[mount] gimbal = {self.mount.gimbal!r} {'without' if self.gimbal is None else 'with'} a [gimbal] "
                 "table; one goes with the other"
             )
+        if self.gimbal is not None and any(fault.kind in ("clock_steps", "autopilot_reboots") for fault in self.fault):
+            raise ValueError("a [gimbal] moves by the autopilot's clock: not with clock_steps or autopilot_reboots")
         if self.world.pack is not None:
             # Its size is the pack's: `stage.make_grounds` looks.
             if self.map != MapTable():

@@ -23,6 +23,7 @@ import rasterio
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
+from ortholoc_edge.errors import MapError
 from ortholoc_edge.geometry.arrays import Float32Array, FloatArray, ImageArray
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.grid import RasterGrid
@@ -202,15 +203,16 @@ def pack_for(scenario: Scenario, folder: Path) -> Path:
     recipe = msgspec.json.encode([_RECIPE, world, msgspec.structs.replace(table, damaged=0.0)])
     name = hashlib.sha256(recipe).hexdigest()[:16]
     whole = folder / name
-    if not (whole / "manifest.json").is_file():
-        logger.info("making the map pack of %s: %.1f km2", scenario.name, world.width_m * world.height_m / 1e6)
-        _build(world, table, whole)
-    if not table.damaged:
-        return whole
     damaged = folder / f"{name}-damaged-{table.damaged:g}"
-    if not damaged.is_dir():
-        _put_whole(damaged, lambda scratch: _damage(whole, scratch, table.damaged))
-    return damaged
+    try:
+        if not (whole / "manifest.json").is_file():
+            logger.info("making the map pack of %s: %.1f km2", scenario.name, world.width_m * world.height_m / 1e6)
+            _build(world, table, whole)
+        if table.damaged and not damaged.is_dir():
+            _put_whole(damaged, lambda scratch: _damage(whole, scratch, table.damaged))
+    except OSError as err:
+        raise MapError(f"{folder}: the map pack of {scenario.name} can't be made there ({err}); see --packs") from err
+    return damaged if table.damaged else whole
 
 
 @lru_cache(maxsize=1)
@@ -304,7 +306,7 @@ def _put_whole(out: Path, make: Callable[[Path], object]) -> None:
         (scratch / "pack").replace(out)
     except OSError:
         # Another process may have been faster; its pack is as good.
-        if not out.is_dir():
+        if not (out / "manifest.json").is_file():
             raise
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
@@ -312,13 +314,17 @@ def _put_whole(out: Path, make: Callable[[Path], object]) -> None:
 
 def _damage(whole: Path, out: Path, share: float) -> None:
     shutil.copytree(whole, out)
-    tiles = sorted(path for path in out.rglob("*.tif"))
-    for path in tiles[: max(1, round(share * len(tiles)))]:
-        data = bytearray(path.read_bytes())
-        middle = len(data) // 2
-        for k in range(middle, min(middle + _DAMAGE_BYTES, len(data))):
-            data[k] ^= 0xFF
-        path.write_bytes(data)
+    # Of both layers, and those in the middle, where the route is.
+    for layer in ("dop", "dsm"):
+        tiles = sorted((out / layer).rglob("*.tif"))
+        count = max(1, round(share * len(tiles)))
+        first = (len(tiles) - count) // 2
+        for path in tiles[first : first + count]:
+            data = bytearray(path.read_bytes())
+            middle = len(data) // 2
+            for k in range(middle, min(middle + _DAMAGE_BYTES, len(data))):
+                data[k] ^= 0xFF
+            path.write_bytes(data)
 
 
 # -- the camera --------------------------------------------------------------

@@ -38,6 +38,36 @@ def without_gnss(rig: Rig) -> Rig:
     return rig
 
 
+# -- what no companion should send ---------------------------------------------
+
+
+@pytest.mark.parametrize(("stack", "firmware"), [("ardupilot", (4, 8, 0)), ("px4", (1, 16, 0))])
+def test_numbers_that_are_none_end_nothing(site: Site, stack: str, firmware: tuple) -> None:
+    rig = Rig(replace(site, earth=stack), stack=stack, firmware=firmware, filter=SYNCHRONISED)
+    core, d = rig.core, dialect
+    values = (math.nan, math.inf, -math.inf, 3e38, 0.0)
+    commands = [*core._commands, *core.estimator.COMMANDS]
+    for command in commands:
+        for value in values:
+            for message in (
+                d.MAVLink_command_long_message(1, 1, command, 0, *[value] * 7),
+                d.MAVLink_command_int_message(1, 1, 0, command, 0, 0, *[value] * 4, 0, 0, value),
+            ):
+                if command != d.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN or not math.isfinite(value):
+                    core.handle(message, rig.now)
+    for group in (0, 1, 6):
+        core.handle(d.MAVLink_request_data_stream_message(1, 1, group, 0, 1), rig.now)
+    for value in values:
+        rig.see(value, value, sigma=1.0, q=[value] * 4, vx=value, vy=value, vz=value)
+        gps = d.MAVLink_gps_input_message(
+            0, 0, 0, 0, 0, 3, 488_026_000, 110_033_000, *[value] * 9, 10
+        )  # fmt: skip
+        core.handle(gps, rig.now)
+        rig.fly(0.05)
+    rig.fly(1.0)
+    assert np.isfinite(core.position_ned_m).all()
+
+
 # -- ArduPilot ----------------------------------------------------------------
 
 

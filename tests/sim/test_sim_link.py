@@ -205,10 +205,29 @@ def test_the_command_tells_events_as_json(tmp_path: Path) -> None:
         (["--udp", "localhost"], "has no port"),
         (["--spoof", "fast"], "--spoof 'fast' is not 1 to 2 numbers"),
         (["--home", "89,0,0"], "latitude from -80 to 80"),
+        (["--gnss-back-at", "9"], "--gnss-back-at goes with --gnss-loss-at"),
+        (["--spoof-at", "9"], "--spoof-at goes with --spoof"),
     ],
 )
 def test_what_cannot_be_is_said(arguments: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert tool.main([*arguments, "--duration", "0.1"]) == 1
+    assert says in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "says"),
+    [
+        ("--delay-ms", "nan", "--delay-ms"),
+        ("--loss", "5", "'5' is not a probability from 0 to 1"),
+        ("--baud", "-9600", "not a whole number from 0"),
+        ("--system-id", "300", "not a system id from 1 to 255"),
+        ("--speed", "0", "--speed"),
+        ("--gnss-loss-at", "-5", "--gnss-loss-at"),
+    ],
+)
+def test_values_out_of_range_are_said(option: str, value: str, says: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        tool.main([f"{option}={value}"])
     assert says in capsys.readouterr().err
 
 

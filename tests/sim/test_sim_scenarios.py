@@ -23,6 +23,7 @@ from ortholoc_sim.gnss import GnssEvent, gnss_at
 from ortholoc_sim.judgement import FRAMES, RESULT, TRACK, Judged, judge, write_files
 from ortholoc_sim.line import End, Line, LineOptions
 from ortholoc_sim.lockstep import Flown, fly
+from ortholoc_sim.loop import STEP_NS
 from ortholoc_sim.report_page import write_page
 from ortholoc_sim.rounded import rounded
 from ortholoc_sim.scenario import Expectations, find_scenario, read_scenario, shipped
@@ -138,6 +139,15 @@ def test_faults_happen_when_they_should(flight: Flight) -> None:
     assert fault.until_s is not None
     assert max(np.diff(stalled)) >= fault.until_s - fault.from_s - 0.7
     assert flight("computer_slow").replaced > 0
+    assert flight("line_lossy").line["lost"] > 20
+    assert "lost" not in flight("gnss_lost").line
+    assert 50.0 < float(flight("line_round_trip").statistics["link.round_trip_ms"] or 0.0) < 70.0
+    # The line takes 2.8 ms for a heartbeat alone; a socket's round trip is 2 to 3 ms.
+    assert float(flight("line_57600").statistics["link.round_trip_ms"] or 0.0) > 8.0
+    assert flight("clock_steps").statistics["link.sync_resets"] == 1
+    twice = [frame.t_s for frame in flight("frames_disordered").frames]
+    assert len(twice) > len(set(twice))
+    assert int(flight("map_damaged").statistics["map_files_damaged"] or 0) == 2
 
 
 def test_a_spoofer_leads_the_autopilot_and_not_the_camera(flight: Flight) -> None:
@@ -168,6 +178,22 @@ def test_each_expectation_can_fail(expect: Expectations, problem: str | None, fl
     result = judge(dataclasses.replace(flown, scenario=msgspec.structs.replace(flown.scenario, expect=plain))).result
     assert result.passed is (problem is None)
     assert problem is None or any(problem in found for found in result.problems), result.problems
+
+
+@pytest.mark.parametrize(
+    ("name", "expect", "problem"),
+    [
+        ("clock_steps", Expectations(says_not=("fixes fused",)), "'fixes fused' was said"),
+        ("without_fixes", Expectations(fused=0.5), "the autopilot took in nothing of what it received"),
+    ],
+)
+def test_what_the_first_flight_does_not_show_can_fail(
+    name: str, expect: Expectations, problem: str, flight: Flight
+) -> None:
+    flown = flight(name)
+    scenario = msgspec.structs.replace(flown.scenario, expect=expect)
+    result = judge(dataclasses.replace(flown, scenario=scenario)).result
+    assert any(problem in found for found in result.problems), result.problems
 
 
 def test_a_false_fix_is_counted(flight: Flight) -> None:
@@ -300,6 +326,29 @@ def test_names_that_are_none(capsys: pytest.CaptureFixture[str]) -> None:
     assert "neither a file nor one of" in capsys.readouterr().err
     assert main(["sim", "--list-scenarios"]) == 0
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == sorted(NAMES)
+
+
+def test_options_of_scenarios_need_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for option in ("--without-fixes", "--short", "--seeds=2", f"--packs={tmp_path}"):
+        assert main(["sim", option]) == 78
+        assert "is of scenarios; name one with --scenario" in capsys.readouterr().err
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "own.toml").write_text(GOOD)
+    twice = [f"--scenario={tmp_path / folder / 'own.toml'}" for folder in ("a", "b")]
+    assert main(["sim", *twice, "--out", str(tmp_path / "out")]) == 78
+    assert "several scenarios are named own" in capsys.readouterr().err
+
+
+def test_faults_that_happen_once_happen_each(packs: Path) -> None:
+    scenario = read_scenario(find_scenario("clock_steps"), short=True)
+    step = msgspec.structs.replace(scenario.fault[0], from_s=3.0)
+    several = msgspec.structs.replace(scenario, fault=(step, msgspec.structs.replace(step, from_s=4.5), step))
+    flown = fly(several, 1, packs)
+    once_ms = step.amount or 0.0
+    assert flown.loop.boot_ns(0) - flown.loop.options.autopilot.boot_offset_ns == pytest.approx(
+        3 * once_ms * MS - (flown.loop.samples[0].stamp_ns - STEP_NS), abs=1
+    )
 
 
 # -- parts -------------------------------------------------------------------

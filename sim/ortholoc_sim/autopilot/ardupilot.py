@@ -199,7 +199,7 @@ class ArduPilot(Estimator):
         elif kind == "GPS_INPUT":
             self._gps_input(message, boot_ns)
         elif message.command == dialect.MAV_CMD_SET_EKF_SOURCE_SET:
-            return self._set_source_set(round(message.param1))
+            return self._set_source_set(round(message.param1) if finite(message.param1) else 0)
         elif kind == "COMMAND_INT":
             return self._external_position(message, boot_ns)
         else:
@@ -359,7 +359,7 @@ class ArduPilot(Estimator):
             delay = "GPS_DELAY_MS" if m.gps_id == 0 else "GPS_DELAY_MS2"
         capture_ns -= round(self._parameters.active(delay) * _MS)
         without = m.ignore_flags & dialect.GPS_INPUT_IGNORE_FLAG_HORIZONTAL_ACCURACY
-        sigma = min(0.0 if without else float(m.horiz_accuracy), 100.0)
+        sigma = min(float(m.horiz_accuracy) if finite(m.horiz_accuracy) and not without else 0.0, 100.0)
         if self.has_gnss:
             record(Verdict.STANDBY, "another receiver has a fix", capture_ns=capture_ns, sigma_m=sigma)
             return
@@ -369,6 +369,8 @@ class ArduPilot(Estimator):
 
     def _external_position(self, m: Message, boot_ns: int) -> int:
         """MAV_CMD_EXTERNAL_POSITION_ESTIMATE: EKF3's setLatLng."""
+        if not finite(m.param1, m.param2):
+            return int(dialect.MAV_RESULT_DENIED)
         position = self._place(m.x, m.y)
         stamp_ns = self._jitter.correct_ns(round(m.param1 * _S), boot_ns)
         capture_ns = max(min(stamp_ns - round(m.param2 * _S), boot_ns), boot_ns - _OLDEST_PLACE_NS)

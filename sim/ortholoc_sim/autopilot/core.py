@@ -10,7 +10,7 @@ from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_sim.autopilot.ardupilot import ArduPilot
 from ortholoc_sim.autopilot.dialect import Message, dialect
-from ortholoc_sim.autopilot.estimator import Estimator, is_origin
+from ortholoc_sim.autopilot.estimator import Estimator, finite, is_origin
 from ortholoc_sim.autopilot.frame import LocalFrame
 from ortholoc_sim.autopilot.mission import Mission
 from ortholoc_sim.autopilot.options import Airframe, AutopilotOptions
@@ -356,7 +356,8 @@ class AutopilotCore:
         wanted = _GROUPS if message.req_stream_id == dialect.MAV_DATA_STREAM_ALL else (message.req_stream_id,)
         for group in wanted:
             for name in _GROUPS.get(group, ()):
-                self._set_interval(_ID[name], 1e6 / message.req_message_rate if message.start_stop else -1.0)
+                runs = message.start_stop and message.req_message_rate
+                self._set_interval(_ID[name], 1e6 / message.req_message_rate if runs else -1.0)
 
     def _set_interval(self, kind: int, interval_us: float) -> None:
         if interval_us <= 0:
@@ -369,6 +370,8 @@ class AutopilotCore:
         answer: Message | None = None
         if number in self.estimator.COMMANDS:
             result = self.estimator.hear(message, boot_ns)
+        elif number in self._commands and not finite(message.param1):
+            result = dialect.MAV_RESULT_DENIED
         elif number in self._commands:
             result, answer = self._commands[number](message)
         else:
@@ -381,7 +384,7 @@ class AutopilotCore:
 
     def _on_set_interval(self, m: Message) -> _Answer:
         kind = round(m.param1)
-        if kind not in self._builders:
+        if kind not in self._builders or not finite(m.param2):
             return dialect.MAV_RESULT_FAILED, None
         self._set_interval(kind, m.param2)
         return dialect.MAV_RESULT_ACCEPTED, None
@@ -399,7 +402,7 @@ class AutopilotCore:
         return (dialect.MAV_RESULT_FAILED if answer is None else dialect.MAV_RESULT_ACCEPTED), answer
 
     def _on_reboot(self, m: Message) -> _Answer:
-        forced = m.get_type() == "COMMAND_LONG" and round(m.param6) == _FORCED_REBOOT
+        forced = m.get_type() == "COMMAND_LONG" and m.param6 == _FORCED_REBOOT
         if round(m.param1) != 1 or not forced:
             return dialect.MAV_RESULT_DENIED, None  # it flies
         self.reboot()

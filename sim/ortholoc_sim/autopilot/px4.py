@@ -544,7 +544,7 @@ class Px4(Estimator):
             drop(Verdict.WRONG_FRAME, f"frame_id {m.frame_id} is no local frame")
             return
         covariance = [nan] * 21 if m.estimator_type == _NAIVE else m.pose_covariance
-        attitude = rotation.from_quaternion(m.q) if finite(*m.q) else None
+        attitude = rotation.from_quaternion(m.q) if finite(*m.q) and any(m.q) else None
         sample = self._sample(
             "ODOMETRY", m.time_usec, boot_ns, (m.x, m.y, m.z), covariance, m.reset_counter, m.quality, m.frame_id,
             attitude,
