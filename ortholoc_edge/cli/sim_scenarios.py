@@ -71,13 +71,23 @@ def list_scenarios() -> int:
 
 def fly_scenarios(args: argparse.Namespace) -> int:
     """Fly what ``--scenario`` names, with every seed; write results and reports below ``--out``."""
+    if args.verbose:
+        return _flown(args)
+    # What the daemon warns of is what is being looked at: it is in the results.
+    log = logging.getLogger("ortholoc_edge")
+    before = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        return _flown(args)
+    finally:
+        log.setLevel(before)
+
+
+def _flown(args: argparse.Namespace) -> int:
     from ortholoc_sim.judgement import figures, judge, times, write_files
     from ortholoc_sim.lockstep import fly
     from ortholoc_sim.report_page import write_page
 
-    if not args.verbose:
-        # What the daemon warns of is what is being looked at: it is in the results.
-        logging.getLogger("ortholoc_edge").setLevel(logging.ERROR)
     scenarios = _chosen(args)
     writable_folder(args.out, "--out")
     packs = args.packs or args.out / "packs"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import html
 import json
+import logging
 import math
 import os
 import re
@@ -329,6 +330,7 @@ def test_names_that_are_none(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_options_of_scenarios_need_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = logging.getLogger("ortholoc_edge").level
     for option in ("--without-fixes", "--short", "--seeds=2", f"--packs={tmp_path}"):
         assert main(["sim", option]) == 78
         assert "is of scenarios; name one with --scenario" in capsys.readouterr().err
@@ -338,6 +340,8 @@ def test_options_of_scenarios_need_one(tmp_path: Path, capsys: pytest.CaptureFix
     twice = [f"--scenario={tmp_path / folder / 'own.toml'}" for folder in ("a", "b")]
     assert main(["sim", *twice, "--out", str(tmp_path / "out")]) == 78
     assert "several scenarios are named own" in capsys.readouterr().err
+    # Flights are quiet; what runs after them in the same process is not.
+    assert logging.getLogger("ortholoc_edge").level == before
 
 
 def test_faults_that_happen_once_happen_each(packs: Path) -> None:
