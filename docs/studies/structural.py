@@ -109,7 +109,7 @@ def variants() -> Iterator[Variant]:
     yield Variant("no look at rivals", patches=((structural.Tracking, "_elsewhere", lambda self, best: None),))
     yield Variant("local mean not taken off", patches=((orientation, "_subtract_local_mean", lambda field, inner: None),))
     yield Variant("no search where the first try does not convince", patches=((structural.Tracking, "_search", lambda self: []),))
-    again = ((structural.Tracking, "_looked_at_again", lambda self, starts, proceed: None),)
+    again = ((structural.Tracking, "_looked_at_again", lambda self, starts, proceed: ()),)
     yield Variant("what the search finds is not drawn anew", patches=again)
     a, b, c = TUNING.levels
     yield Variant("two levels, 128 and 256 px", replace(TUNING, levels=(a, b)))

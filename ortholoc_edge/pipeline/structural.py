@@ -9,7 +9,7 @@ among turns, scales and shifts that the prior allows.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -346,7 +346,7 @@ class Tracking:
         starts = self._search() if proceed() else []
         for look in (self._likeliest, self._looked_at_again):
             # The last level costs as much as all before it: only the best of the starts gets there.
-            approach = look(starts, proceed)
+            approach = _most_promising(look(starts, proceed))
             found = None if approach is None else self._arrive(approach)
             if found is not None and (best is None or found.inliers > best.inliers):
                 best = found
@@ -354,45 +354,32 @@ class Tracking:
                 break
         return best
 
-    def _likeliest(self, starts: Sequence[Rigid3], proceed: Callable[[], bool]) -> list[_Step] | None:
-        """The approach with the most support from the first starts; the first with enough of it ends the search."""
-        best: list[_Step] | None = None
+    def _likeliest(self, starts: Sequence[Rigid3], proceed: Callable[[], bool]) -> Iterator[list[_Step] | None]:
+        """The approaches from the first starts."""
         seen: list[Rigid3] = []
         for start in starts[:_CANDIDATES]:
             if not proceed():
-                break
-            another = self._approach(start, seen)
-            if another is not None and (best is None or another[-1].agree > best[-1].agree):
-                best = another
-            if best is not None and best[-1].support >= _PROMISING:
-                break
-        return best
+                return
+            yield self._approach(start, seen)
 
-    def _looked_at_again(self, starts: Sequence[Rigid3], proceed: Callable[[], bool]) -> list[_Step] | None:
-        """The same from all starts, each drawn anew before its shift is looked for: a peak far from the prediction is
-        of a view that had little in common with the frame, and its place is but roughly right. Only those that fit best
-        at the first level get to the second."""
+    def _looked_at_again(self, starts: Sequence[Rigid3], proceed: Callable[[], bool]) -> Iterator[list[_Step] | None]:
+        """From all starts, each drawn anew before its shift is looked for: a peak far from the prediction is of a view
+        that had little in common with the frame, and its place is but roughly right. Only those that fit best at the
+        first level get to the second."""
         if not starts or not proceed():
-            return None
+            return
         drawn = (self._level(0, start, self._predicted, look_wide=True) for start in starts)
         firsts = sorted(
             (step for step in drawn if step is not None), key=lambda step: -float(step.scores[step.inliers].sum())
         )
-        best: list[_Step] | None = None
         seen: list[Rigid3] = []
         for step in firsts:
             # Not asked again: to draw them all and then to follow none would be time for nothing.
             if len(seen) == _LOOKED_AT_AGAIN:
-                break
-            if any(self._alike(step.pose, other) for other in seen):
-                continue
-            seen.append(step.pose)
-            another = self._onward(step)
-            if another is not None and (best is None or another[-1].agree > best[-1].agree):
-                best = another
-            if best is not None and best[-1].support >= _PROMISING:
-                break
-        return best
+                return
+            if not any(self._alike(step.pose, other) for other in seen):
+                seen.append(step.pose)
+                yield self._onward(step)
 
     def _elsewhere(self, best: Track) -> Track | None:
         """The best track that ends elsewhere: rows of trees or of panels fit one row further, too."""
@@ -692,6 +679,17 @@ class Tracking:
         sigma = self._prior.height_sigma_m / height_m
         count = min(math.ceil(_SEARCH_SIGMAS * math.log1p(sigma) / math.log(_ZOOM) - 0.5), _MAX_ZOOMS // 2)
         return [height_m * (_ZOOM**k - 1.0) for k in range(-count, count + 1)]
+
+
+def _most_promising(approaches: Iterable[list[_Step] | None]) -> list[_Step] | None:
+    """That with the most matches that agree; the first with enough support ends the search."""
+    best: list[_Step] | None = None
+    for approach in approaches:
+        if approach is not None and (best is None or approach[-1].agree > best[-1].agree):
+            best = approach
+        if best is not None and best[-1].support >= _PROMISING:
+            break
+    return best
 
 
 def _map_px(terrain: Terrain, query: QueryFields, pose: Rigid3) -> list[float]:

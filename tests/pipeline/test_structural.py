@@ -187,7 +187,7 @@ def test_a_place_far_off_the_prediction_is_found_by_looking_again(
     """3.5 sigmas: the predicted view has too little in common with the frame to say more than where about."""
     prior = rendered.prior(truth, error_m, (0.0, 0.0, 0.0), sigma_m=(float(np.hypot(*error_m[:2])) / 3.5, 2.0))
     assert_near(localize(rendered.frame(truth), prior), truth)
-    monkeypatch.setattr(Tracking, "_looked_at_again", lambda self, starts, proceed: None)
+    monkeypatch.setattr(Tracking, "_looked_at_again", lambda self, starts, proceed: ())
     assert_rejected(localize(rendered.frame(truth), prior), Reason.LOW_CONTRAST, Reason.FEW_MATCHES)
 
 
