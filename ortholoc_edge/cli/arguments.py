@@ -5,11 +5,14 @@ from __future__ import annotations
 import argparse
 import math
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 from ortholoc_edge.bench.replay import Length
 from ortholoc_edge.errors import ConfigError, OrtholocError
 
+N = TypeVar("N", int, float)
 Triple = tuple[float, float, float]
 
 # Beyond the Earth's size; also of the coordinates of any projection.
@@ -83,6 +86,22 @@ def positive_int(text: str) -> int:
 def seed(text: str) -> int:
     """0, 1, 2, …"""
     return _whole(text, 0)
+
+
+def within(what: str, kind: Callable[[str], N], least: float, most: float) -> Callable[[str], N]:
+    """An argument type: numbers of a ``kind`` (int or float) in a range; ``what`` names one in the refusal."""
+
+    def parse(text: str) -> N:
+        value: N | None
+        try:
+            value = kind(text)
+        except ValueError:
+            value = None
+        if value is None or not least <= value <= most:
+            raise argparse.ArgumentTypeError(f"{text!r} is not {what} from {least:g} to {most:g}")
+        return value
+
+    return parse
 
 
 def length(text: str) -> Length:

@@ -182,7 +182,7 @@ class Country:
     def rgb(self, grid: RasterGrid, crs: str, look: Look) -> ImageArray:
         """(H, W, 3) uint8 orthophoto on a grid of ``crs`` at pixels up to about 2 m."""
         out = np.empty((grid.height, grid.width, 3), dtype=np.uint8)
-        for row, column, block in _blocks(grid, 4):
+        for row, column, block in blocks(grid, 4):
             view = self.view(block, crs)
             drawn = _Painter(self, view, look).picture()
             height, width = drawn.shape[0] - 8, drawn.shape[1] - 8
@@ -192,7 +192,7 @@ class Country:
     def heights(self, grid: RasterGrid, crs: str, look: Look) -> Float32Array:
         """(H, W) float32 m: the surface at the pixels' centres."""
         out = np.empty((grid.height, grid.width), dtype=np.float32)
-        for row, column, block in _blocks(grid, 0):
+        for row, column, block in blocks(grid):
             drawn = _Painter(self, self.view(block, crs), look).surface()
             out[row : row + drawn.shape[0], column : column + drawn.shape[1]] = drawn
         return out
@@ -297,10 +297,11 @@ def hole_mask(country: Country, grid: RasterGrid, crs: str) -> BoolArray:
     return np.asarray(mask > 0, dtype=bool)
 
 
-def _blocks(grid: RasterGrid, margin: int) -> Iterator[tuple[int, int, RasterGrid]]:
-    for row in range(0, grid.height, _BLOCK_PX):
-        for column in range(0, grid.width, _BLOCK_PX):
-            width, height = min(_BLOCK_PX, grid.width - column), min(_BLOCK_PX, grid.height - row)
+def blocks(grid: RasterGrid, margin: int = 0, side_px: int = _BLOCK_PX) -> Iterator[tuple[int, int, RasterGrid]]:
+    """Row and column of the squares that a raster is drawn in, and their grids, larger by ``margin`` px all around."""
+    for row in range(0, grid.height, side_px):
+        for column in range(0, grid.width, side_px):
+            width, height = min(side_px, grid.width - column), min(side_px, grid.height - row)
             yield row, column, grid.crop(column - margin, row - margin, width + 2 * margin, height + 2 * margin)
 
 

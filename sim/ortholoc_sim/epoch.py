@@ -60,10 +60,15 @@ class Epoch:
 
     @property
     def sun(self) -> FloatArray:
-        """(3,) unit vector to the sun: grid east, grid north, up."""
-        azimuth, elevation = np.deg2rad([self.sun_azimuth_deg, self.sun_elevation_deg])
-        flat = np.cos(elevation)
-        return np.array([flat * np.sin(azimuth), flat * np.cos(azimuth), np.sin(elevation)])
+        """See `towards_sun`."""
+        return towards_sun(self.sun_azimuth_deg, self.sun_elevation_deg)
+
+
+def towards_sun(azimuth_deg: float, elevation_deg: float) -> FloatArray:
+    """(3,) unit vector to the sun: grid east, grid north, up. ``azimuth_deg`` is from grid north, clockwise."""
+    azimuth, elevation = np.deg2rad([azimuth_deg, elevation_deg])
+    flat = np.cos(elevation)
+    return np.array([flat * np.sin(azimuth), flat * np.cos(azimuth), np.sin(elevation)])
 
 
 # A July survey, late morning.

@@ -48,7 +48,7 @@ from ortholoc_sim import demo_pack_path
 from ortholoc_sim.autopilot import AutopilotOptions, UdpPort, Verdict
 from ortholoc_sim.camera import Placement, Renderer, Sensor
 from ortholoc_sim.epoch import FLIGHT, Epoch
-from ortholoc_sim.loop import STEP_NS, ClosedLoop, LoopOptions
+from ortholoc_sim.loop import STEP_NS, ClosedLoop, LoopOptions, true_camera_pose
 from ortholoc_sim.make_demo_pack import DEMO_SOUTH_M, DEMO_WEST_M
 from ortholoc_sim.site import Site
 from ortholoc_sim.vehicle import VehicleOptions
@@ -377,7 +377,7 @@ def run_flight(options: FlightOptions, under_test: UnderTest | None = None, cloc
     loop_holder: list[ClosedLoop] = []
 
     def pose_at(stamp_ns: int) -> Rigid3 | None:
-        return true_pose(loop_holder[0], site, options, stamp_ns) if loop_holder else None
+        return true_camera_pose(loop_holder[0], site, options.mount, stamp_ns) if loop_holder else None
 
     outcomes: list[tuple[int, Outcome]] = []
     failures: list[BaseException] = []
@@ -425,20 +425,6 @@ def run_flight(options: FlightOptions, under_test: UnderTest | None = None, cloc
     if failures:
         raise OrtholocError(f"simulated aircraft: {failures[0]}") from failures[0]
     return make_report(loop, site, options, list(outcomes), camera.frames)
-
-
-def true_pose(loop: ClosedLoop, site: Site, options: FlightOptions, stamp_ns: int) -> Rigid3 | None:
-    """``map_from_camera`` as it really is at a stamp; None before the start and in the future."""
-    truth = loop.truth_at(stamp_ns)
-    if truth is None:
-        return None
-    gimbal = options.autopilot.gimbal
-    if gimbal is None:
-        mounted = options.mount.body_from_camera()
-    else:
-        turned = gimbal.ned_from_gimbal(truth.ned_from_body, loop.boot_ns(stamp_ns))
-        mounted = options.mount.body_from_camera_in(truth.ned_from_body.T @ turned)
-    return site.camera_pose(truth.position_ned_m, truth.ned_from_body, mounted)
 
 
 def _fly(
@@ -521,7 +507,7 @@ def make_report(
         if not isinstance(outcome, Fix):
             rejections[str(outcome.reason)] += 1
             continue
-        pose = true_pose(loop, site, options, outcome.stamp_ns)
+        pose = true_camera_pose(loop, site, options.mount, outcome.stamp_ns)
         if pose is None:
             continue
         fixes_after += outcome.stamp_ns >= lost_ns

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ortholoc_edge.geometry.arrays import Float32Array, ImageArray
+from ortholoc_edge.geometry.arrays import Float32Array, FloatArray, ImageArray
 from ortholoc_edge.geometry.camera import Camera
 
 _MID_GREY = 112.0
-_LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)
+LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,9 @@ class Exposure:
     def expose(self, clean: ImageArray, camera: Camera, rng: np.random.Generator) -> ImageArray:
         """(H, W, 3) RGB uint8 of a clean picture (H, W, 3) RGB uint8; ``rng`` draws the noise."""
         image = cv2.GaussianBlur(clean, (0, 0), self.blur_px).astype(np.float32)
-        image = np.asarray(cv2.filter2D(image, -1, self._smear()), dtype=np.float32)
+        along = np.linspace(-0.5, 0.5, 41) * self.motion_px
+        smear = smear_kernel(np.column_stack([along * np.cos(self.motion_rad), along * np.sin(self.motion_rad)]))
+        image = np.asarray(cv2.filter2D(image, -1, smear), dtype=np.float32)
         u = (np.arange(camera.width, dtype=np.float32) - np.float32(camera.cx)) / np.float32(camera.fx)
         v = (np.arange(camera.height, dtype=np.float32) - np.float32(camera.cy)) / np.float32(camera.fy)
         r2 = u[None] ** 2 + v[:, None] ** 2
@@ -92,20 +94,21 @@ class Exposure:
         image -= np.float32(0.5)
         image *= np.float32(self.contrast)
         image += np.float32(0.5)
-        grey = (image @ _LUMA)[..., None]
+        grey = (image @ LUMA)[..., None]
         image = np.asarray(grey + (image - grey) * np.float32(self.saturation), dtype=np.float32)
         image *= np.float32(255.0)
         sigma = np.float32(self.noise) + np.float32(self.shot) * np.sqrt(np.clip(grey, 0.0, 1.0))
         image += sigma * rng.standard_normal(image.shape, dtype=np.float32)
         return np.clip(np.round(image), 0, 255).astype(np.uint8)
 
-    def _smear(self) -> Float32Array:
-        """The kernel of the motion: a line of its length, sampled finely."""
-        reach = int(np.ceil(self.motion_px / 2)) + 1
-        kernel = np.zeros((2 * reach + 1, 2 * reach + 1), dtype=np.float32)
-        for t in np.linspace(-0.5, 0.5, 41) * self.motion_px:
-            u, v = reach + t * np.cos(self.motion_rad), reach + t * np.sin(self.motion_rad)
-            left, top = int(np.floor(u)), int(np.floor(v))
-            a, b = u - left, v - top
-            kernel[top : top + 2, left : left + 2] += np.array([[(1 - a) * (1 - b), a * (1 - b)], [(1 - a) * b, a * b]])
-        return np.asarray(kernel / kernel.sum(), dtype=np.float32)
+
+def smear_kernel(offsets_px: FloatArray) -> Float32Array:
+    """(K, K) what a filter takes for a motion during the exposure through ``offsets_px`` (N, 2), sampled finely."""
+    reach = int(np.ceil(np.linalg.norm(offsets_px, axis=1).max())) + 1
+    kernel = np.zeros((2 * reach + 1, 2 * reach + 1), dtype=np.float32)
+    for offset in offsets_px:
+        u, v = reach + offset
+        left, top = int(np.floor(u)), int(np.floor(v))
+        a, b = u - left, v - top
+        kernel[top : top + 2, left : left + 2] += np.array([[(1 - a) * (1 - b), a * (1 - b)], [(1 - a) * b, a * b]])
+    return np.asarray(kernel / kernel.sum(), dtype=np.float32)

@@ -24,7 +24,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ortholoc_edge.cli.arguments import non_negative, positive, seed
+from ortholoc_edge.cli.arguments import non_negative, positive, seed, within
 from ortholoc_edge.clock import Clock, SystemClock
 from ortholoc_edge.errors import ConfigError, OrtholocError
 from ortholoc_edge.geometry.arrays import FloatArray
@@ -359,7 +359,7 @@ class SimulatedLink:
             "lat_deg": round(place.lat_deg, 7),
             "lon_deg": round(place.lon_deg, 7),
             "amsl_m": round(place.height_amsl_m, 2),
-            "error_m": round(float(np.hypot(*(autopilot.position_ned_m - autopilot.true_position_m)[:2])), 3),
+            "error_m": round(self.error_m, 3),
             "gnss": autopilot.gnss,
             "synchronised": autopilot.synchronised,
         }
@@ -402,13 +402,17 @@ def _arguments() -> argparse.ArgumentParser:
     over.add_argument("--udpout", metavar="[HOST:]PORT", help="send there at once, as an autopilot behind a radio does")
     over.add_argument("--tcp", metavar="[HOST:]PORT", help="serve one companion at a time")
     over.add_argument("--pty", action="store_true", help="a pseudo-terminal, whose name is told")
+    probability = within("a probability", float, 0.0, 1.0)
     line = parser.add_argument_group("the line between")
-    line.add_argument("--baud", type=_whole, default=0, metavar="N", help="of a serial line; 0 is infinitely fast")
+    line.add_argument(
+        "--baud", type=within("a whole number", int, 0, 10_000_000), default=0, metavar="N",
+        help="of a serial line; 0 is infinitely fast",
+    )  # fmt: skip
     line.add_argument("--delay-ms", type=non_negative, default=0.0, metavar="MS")
     line.add_argument("--jitter-ms", type=non_negative, default=0.0, metavar="MS")
-    line.add_argument("--loss", type=_probability, default=0.0, metavar="P", help="probability that a frame is lost")
+    line.add_argument("--loss", type=probability, default=0.0, metavar="P", help="probability that a frame is lost")
     line.add_argument(
-        "--corruption", type=_probability, default=0.0, metavar="P", help="probability of a wrong bit, per byte"
+        "--corruption", type=probability, default=0.0, metavar="P", help="probability of a wrong bit, per byte"
     )
     flight = parser.add_argument_group("the flight")
     flight.add_argument("--home", metavar="LAT,LON,AMSL", help="default: 48.8026,11.0033,382.7")
@@ -429,32 +433,10 @@ def _arguments() -> argparse.ArgumentParser:
     pilot.add_argument("--no-origin", action="store_true", help="without GNSS from the start: it waits for an origin")
     pilot.add_argument("--stamps", choices=("firmware", "ideal"), default="firmware")
     pilot.add_argument("--streams", action="store_true", help="send the usual messages unasked")
-    pilot.add_argument("--system-id", type=_system_id, default=1, metavar="N")
+    pilot.add_argument("--system-id", type=within("a system id", int, 1, 255), default=1, metavar="N")
     parser.add_argument("--seed", type=seed, default=1)
     parser.add_argument("--json", action="store_true", help="one JSON object a line")
     return parser
-
-
-def _whole(text: str) -> int:
-    return int(_within(text, "a whole number", int, 0, 10_000_000))
-
-
-def _system_id(text: str) -> int:
-    return int(_within(text, "a system id", int, 1, 255))
-
-
-def _probability(text: str) -> float:
-    return _within(text, "a probability", float, 0.0, 1.0)
-
-
-def _within(text: str, what: str, kind: Callable[[str], float], least: float, most: float) -> float:
-    try:
-        value = kind(text)
-    except ValueError:
-        value = math.nan
-    if not least <= value <= most:
-        raise argparse.ArgumentTypeError(f"{text!r} is not {what} from {least:g} to {most:g}")
-    return value
 
 
 def _numbers(text: str, what: str, least: int, most: int) -> list[float]:

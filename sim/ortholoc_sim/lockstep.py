@@ -33,12 +33,12 @@ from ortholoc_edge.pipeline.outcome import Fix, Outcome
 from ortholoc_edge.vehicle import STATE_WAIT_NS
 from ortholoc_sim.autopilot import Message
 from ortholoc_sim.line import End, Line, LineTransport
-from ortholoc_sim.loop import STEP_NS, ClosedLoop, LoopOptions
+from ortholoc_sim.loop import STEP_NS, ClosedLoop, LoopOptions, true_camera_pose
 from ortholoc_sim.rounded import rounded
 from ortholoc_sim.scenario import Fault, FaultKind, LatencyTable, Scenario
 from ortholoc_sim.site import Site
 from ortholoc_sim.stage import Studio, make_grounds, pack_for
-from ortholoc_sim.vehicle import Truth, VehicleOptions
+from ortholoc_sim.vehicle import VehicleOptions
 
 logger = logging.getLogger(__name__)
 
@@ -310,9 +310,9 @@ class _Flight:
 
     def true_pose(self, stamp_ns: int) -> Rigid3:
         """``map_from_camera`` at a time that was flown."""
-        truth = self._loop.truth_at(stamp_ns)
-        assert truth is not None, "frames are drawn when their time has passed"
-        return self._camera_pose(truth, stamp_ns)
+        pose = true_camera_pose(self._loop, self._site, self.scenario.mount, stamp_ns)
+        assert pose is not None, "frames are drawn when their time has passed"
+        return pose
 
     def run(self, progress: Callable[[float], None]) -> Flown:
         # One environment of rasterio's for all steps: see `ClosedLoop.advance`.
@@ -446,15 +446,6 @@ class _Flight:
             # No budget: the ladder of detail goes by wall time, which is not the same twice.
             timing=TimingOptions(max_age_ms=scenario.timing.max_age_ms, budget_ms=math.inf),
         )
-
-    def _camera_pose(self, truth: Truth, stamp_ns: int) -> Rigid3:
-        mount, gimbal = self.scenario.mount, self._loop.options.autopilot.gimbal
-        if gimbal is None:
-            mounted = mount.body_from_camera()
-        else:
-            turned = gimbal.ned_from_gimbal(truth.ned_from_body, self._loop.boot_ns(stamp_ns))
-            mounted = mount.body_from_camera_in(truth.ned_from_body.T @ turned)
-        return self._site.camera_pose(truth.position_ned_m, truth.ned_from_body, mounted)
 
 
 class _NoFrames:

@@ -13,8 +13,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import rasterio
 
+from ortholoc_edge.config import MountOptions
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import FloatArray
+from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_sim.autopilot import Airframe, AutopilotCore, AutopilotOptions, Message
 from ortholoc_sim.fixed_wing import FixedWing, FixedWingOptions
 from ortholoc_sim.gnss import GnssEvent, gnss_at
@@ -194,3 +196,17 @@ class ClosedLoop:
             rotation.slerp(a.truth.ned_from_body, b.truth.ned_from_body, t),
             (1 - t) * a.truth.rates_body_rad_s + t * b.truth.rates_body_rad_s,
         )
+
+
+def true_camera_pose(loop: ClosedLoop, site: Site, mount: MountOptions, stamp_ns: int) -> Rigid3 | None:
+    """``map_from_camera`` as it really is at a stamp of the owner's clock; None before the start and in the future."""
+    truth = loop.truth_at(stamp_ns)
+    if truth is None:
+        return None
+    gimbal = loop.options.autopilot.gimbal
+    if gimbal is None:
+        mounted = mount.body_from_camera()
+    else:
+        turned = gimbal.ned_from_gimbal(truth.ned_from_body, loop.boot_ns(stamp_ns))
+        mounted = mount.body_from_camera_in(truth.ned_from_body.T @ turned)
+    return site.camera_pose(truth.position_ned_m, truth.ned_from_body, mounted)

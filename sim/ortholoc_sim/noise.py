@@ -1,11 +1,13 @@
-"""Value noise on rasters."""
+"""Noise: of values on rasters, and of what wanders with time."""
 
 from __future__ import annotations
+
+import math
 
 import cv2
 import numpy as np
 
-from ortholoc_edge.geometry.arrays import Float32Array
+from ortholoc_edge.geometry.arrays import Float32Array, FloatArray
 
 
 def blobs(shape: tuple[int, int], size_px: float, seed: int) -> Float32Array:
@@ -36,3 +38,9 @@ def octaves(shape: tuple[int, int], sizes_px: tuple[float, ...], weights: tuple[
 def grain(shape: tuple[int, int], seed: int) -> Float32Array:
     """White noise of unit variance, one value per pixel."""
     return np.random.default_rng([seed, 5]).standard_normal(shape, dtype=np.float32)
+
+
+def wander(value: FloatArray, sigma: float | FloatArray, time_s: float, dt_s: float, white: FloatArray) -> FloatArray:
+    """One step of an Ornstein-Uhlenbeck process of standard deviation ``sigma``, given standard normal noise."""
+    decay = math.exp(-dt_s / time_s)
+    return np.asarray(decay * value + sigma * math.sqrt(1.0 - decay**2) * white, dtype=np.float64)

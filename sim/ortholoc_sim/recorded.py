@@ -9,24 +9,22 @@ nothing of what changed on the ground since the map was made. Results have to sa
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 from msgspec import Struct
 from rasterio.fill import fillnodata
 
 from ortholoc_edge.errors import MapError
-from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, ImageArray
+from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, ImageArray
 from ortholoc_edge.geometry.grid import RasterGrid
 from ortholoc_edge.tiles.lattice import Bounds
 from ortholoc_edge.tiles.store import MapStore
-from ortholoc_sim.epoch import SURVEY
+from ortholoc_sim.epoch import SURVEY, towards_sun
+from ortholoc_sim.lens import LUMA
 from ortholoc_sim.noise import blobs, grain
 from ortholoc_sim.world import Scene, WorldSpec, sunlight
 
 NOTICE = "synthetic: the camera sees the map's own orthophoto, changed in light and tone only"
-_LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 # Where the orthophoto has no data the ground is of one tone.
 _BARE = 118
 # Holes of the surface model are closed from so far; what is left has the typical height.
@@ -58,11 +56,6 @@ class Light(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     grain: float = 0.03
     seed: int = 1
 
-    @property
-    def sun(self) -> FloatArray:
-        """(3,) unit vector to it: grid east, grid north, up."""
-        return replace(SURVEY, sun_azimuth_deg=self.sun_azimuth_deg, sun_elevation_deg=self.sun_elevation_deg).sun
-
 
 def scene_of_map(
     store: MapStore, bounds_map: Bounds | None = None, light: Light | None = None, gsd_m: float | None = None
@@ -89,7 +82,7 @@ def scene_of_map(
     whole = _whole(heights.dsm, heights.dsm_grid.gsd_m)
     surface = _resampled(whole, heights.dsm_grid, grid)
     # On the surface model's own grid: it has nothing finer to shade.
-    lit = sunlight(whole, heights.dsm_grid.gsd_m, light.sun)
+    lit = sunlight(whole, heights.dsm_grid.gsd_m, towards_sun(light.sun_azimuth_deg, light.sun_elevation_deg))
     lit[~np.isfinite(heights.dsm)] = 1.0
     texture = relit(window.rgb, window.valid, _resampled(lit, heights.dsm_grid, grid), grid.gsd_m, light)
     scene = Scene(
@@ -114,7 +107,7 @@ def relit(rgb: ImageArray, valid: BoolArray, lit: Float32Array, gsd_m: float, li
     before = float(image.mean())
     image *= np.float32(1 / 255)
     image = np.asarray(cv2.pow(image, light.gamma), dtype=np.float32)
-    grey = (image @ _LUMA)[..., None]
+    grey = (image @ LUMA)[..., None]
     image = np.asarray(grey + (image - grey) * np.float32(light.saturation), dtype=np.float32)
     image *= share[..., None] * np.array(light.white, dtype=np.float32)
     image *= np.float32(before / max(float(image.mean()), 1e-6))

@@ -11,7 +11,7 @@ import logging
 import shutil
 import tempfile
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -35,8 +35,9 @@ from ortholoc_edge.tiles.store import MapStore
 from ortholoc_edge.tiles.vertical import derive_offsets
 from ortholoc_sim import demo_pack_path
 from ortholoc_sim.camera import Placement, Renderer, Sensor
-from ortholoc_sim.country import CENTRE, FLIGHT, FRAME, SURVEYS, Country, Look
+from ortholoc_sim.country import CENTRE, FLIGHT, FRAME, SURVEYS, Country, Look, blocks
 from ortholoc_sim.crossdomain import DOP_GSD_M, DSM_GSD_M, CrossDomain, Kind, MapLayers
+from ortholoc_sim.lens import smear_kernel
 from ortholoc_sim.noise import blobs
 from ortholoc_sim.recorded import Light, scene_of_map
 from ortholoc_sim.scenario import CameraTable, MapTable, Scenario, WorldTable
@@ -261,19 +262,15 @@ def _write_country(world: WorldTable, table: MapTable, dop_path: Path, dsm_path:
 
     dop, dsm = grid(DOP_GSD_M), grid(DSM_GSD_M)
     pictures = (
-        (row, column, np.moveaxis(country.rgb(block, FRAME, dop_look), 2, 0)) for row, column, block in _blocks(dop)
+        (row, column, np.moveaxis(country.rgb(block, FRAME, dop_look), 2, 0))
+        for row, column, block in blocks(dop, side_px=_BLOCK_PX)
     )
     _write(dop_path, dop, pictures, photometric="RGB")
-    heights = ((row, column, country.heights(block, FRAME, dsm_look)[None]) for row, column, block in _blocks(dsm))
+    heights = (
+        (row, column, country.heights(block, FRAME, dsm_look)[None])
+        for row, column, block in blocks(dsm, side_px=_BLOCK_PX)
+    )
     _write(dsm_path, dsm, heights, nodata=np.nan)
-
-
-def _blocks(grid: RasterGrid) -> Iterator[tuple[int, int, RasterGrid]]:
-    """Row and column of a grid's squares, and their grids."""
-    for row in range(0, grid.height, _BLOCK_PX):
-        for column in range(0, grid.width, _BLOCK_PX):
-            size = min(_BLOCK_PX, grid.width - column), min(_BLOCK_PX, grid.height - row)
-            yield row, column, grid.crop(column, row, *size)
 
 
 def _write(
@@ -401,15 +398,8 @@ class Studio:
         length_px = float(np.hypot(*way))
         if length_px < 0.3:
             return clean
-        count = int(np.ceil(2 * length_px)) + 1
-        reach = int(np.ceil(length_px / 2)) + 1
-        kernel = np.zeros((2 * reach + 1, 2 * reach + 1), dtype=np.float32)
-        for t in np.linspace(-0.5, 0.5, count):
-            u, v = reach + t * way
-            left, top = int(np.floor(u)), int(np.floor(v))
-            a, b = u - left, v - top
-            kernel[top : top + 2, left : left + 2] += np.array([[(1 - a) * (1 - b), a * (1 - b)], [(1 - a) * b, a * b]])
-        return np.asarray(cv2.filter2D(clean, -1, kernel / kernel.sum()), dtype=np.uint8)
+        offsets = np.linspace(-0.5, 0.5, int(np.ceil(2 * length_px)) + 1)[:, None] * way
+        return np.asarray(cv2.filter2D(clean, -1, smear_kernel(offsets)), dtype=np.uint8)
 
 
 def _rows(camera: Camera, top: int, end: int) -> Camera:

@@ -16,6 +16,7 @@ import numpy as np
 
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import FloatArray
+from ortholoc_sim.noise import wander
 
 GRAVITY_M_S2 = 9.80665
 
@@ -76,9 +77,7 @@ class Wind:
 
     def gust(self, dt_s: float) -> FloatArray:
         """(3,) NED m/s after one more step, without the mean."""
-        decay = float(np.exp(-dt_s / self._time_s))
-        white = np.sqrt(1.0 - decay**2) * self._spread_m_s * self._rng.standard_normal(3)
-        self._gust = decay * self._gust + white
+        self._gust = wander(self._gust, self._spread_m_s, self._time_s, dt_s, self._rng.standard_normal(3))
         return self._gust
 
 

@@ -142,11 +142,6 @@ def generate(spec: WorldSpec | None = None, layout: Layout | None = None, terrai
     return World(spec, layout, terrain, cover, paint, detail, soil)
 
 
-def appearance(world: World, epoch: Epoch) -> ImageArray:
-    """(H, W, 3) RGB orthographic texture of the world at ``epoch``."""
-    return build_scene(world, epoch).texture
-
-
 class _Pen:
     """Draws vectors in local metres on rasters of the world."""
 

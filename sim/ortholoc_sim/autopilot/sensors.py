@@ -15,6 +15,7 @@ import numpy as np
 
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import FloatArray
+from ortholoc_sim.noise import wander
 from ortholoc_sim.vehicle import GRAVITY_M_S2, Truth
 
 _S = 1_000_000_000
@@ -55,12 +56,6 @@ class SensorOptions:
     gnss_velocity_m_s: float = 0.15
     baro_walk_m: float = 0.05
     baro_noise_m: float = 0.15
-
-
-def wander(value: FloatArray, sigma: float, time_s: float, dt_s: float, white: FloatArray) -> FloatArray:
-    """One step of an Ornstein-Uhlenbeck process of standard deviation ``sigma``."""
-    decay = math.exp(-dt_s / time_s)
-    return np.asarray(decay * value + sigma * math.sqrt(1.0 - decay**2) * white, dtype=np.float64)
 
 
 class Imu:
