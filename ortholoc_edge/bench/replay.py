@@ -81,7 +81,8 @@ class PriorNoise:
     Attributes:
         attitude_deg: roll, pitch, yaw.
         position: horizontal per axis and vertical; of the first frame and, for GPS and truth-noise, of all.
-        odometry_ratio: error of a displacement per axis as a part of its length.
+        odometry_ratio: error of a displacement: of either horizontal axis as a part of its length, of the vertical as
+            a part of the climb, since autopilots hold height by a barometer.
         odometry_drift_m_per_s: per axis, drawn anew for every leg.
     """
 
@@ -170,7 +171,8 @@ class SimulatedAutopilot:
             step = position - before
             step[:2] /= grid_scale
             step_ned = frames.map_from_ned_rotation(convergence_rad).T @ step
-            ratio = self._noise.odometry_ratio * float(np.linalg.norm(step_ned))
+            length_m = float(np.linalg.norm(step_ned))
+            ratio = self._noise.odometry_ratio * np.array([length_m, length_m, abs(step_ned[2])])
             drift = self._noise.odometry_drift_m_per_s * (stamp_ns - before_ns) * 1e-9
             error = self._random.normal(size=3) * ratio + self._random.normal(size=3) * drift
             self._odometry_ned_m = self._odometry_ned_m + step_ned + error
@@ -237,12 +239,20 @@ def replay_flight(
         )  # fmt: skip
 
 
+# Between two photos of a survey.
+_LONGEST_LEG_S = 60.0
+
+
 def _tracker_options(noise: PriorNoise) -> TrackerOptions:
     """The tracker is told what odometry it has, as an integrator would, with some reserve."""
     reserve = 1.25
     return TrackerOptions(
         odometry_ratio=min(reserve * noise.odometry_ratio, 1.0),
+        climb_ratio=min(reserve * noise.odometry_ratio, 1.0),
         odometry_drift_m_per_s=reserve * noise.odometry_drift_m_per_s,
+        climb_error_m_per_s=reserve * noise.odometry_drift_m_per_s,
+        # Drawn anew for every leg, it lasts for as long as any leg.
+        climb_memory_s=_LONGEST_LEG_S,
     )
 
 

@@ -28,15 +28,24 @@ class TrackerOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """How fast the prediction loses certainty between fixes.
 
     ``odometry_ratio``: error of the autopilot's displacement as a part of the distance flown.
-    ``odometry_drift_m_per_s``: and as a function of time.
+    ``odometry_drift_m_per_s``: and as a function of time. Both are of the horizontal.
+    ``climb_ratio``: error of the height as a part of the climb; a barometer errs so in air warmer than the standard's.
+    ``climb_error_m_per_s``: and of the vertical velocity, which the autopilot's barometer corrects within
+    ``climb_memory_s``: the height drifts with the root of the time, where the horizontal runs away. In a long outage
+        that alone tells a surface model of another datum from a climb.
     ``unaided_speed_m_per_s``: without odometry, the speed at which the vehicle may have left.
+    ``unaided_climb_m_per_s``: and at which it may have climbed.
     ``lost_sigma_m``: horizontal 1-sigma beyond which nothing is known worth predicting from.
     ``jump_m``: a fix this far from the prediction raises the reset counter, if it is also beyond three sigmas.
     """
 
     odometry_ratio: Annotated[float, Meta(ge=0, le=1)] = 0.03
     odometry_drift_m_per_s: Annotated[float, Meta(ge=0)] = 0.2
+    climb_ratio: Annotated[float, Meta(ge=0, le=1)] = 0.05
+    climb_error_m_per_s: Annotated[float, Meta(ge=0)] = 0.2
+    climb_memory_s: Annotated[float, Meta(gt=0)] = 3.0
     unaided_speed_m_per_s: Annotated[float, Meta(gt=0)] = 15.0
+    unaided_climb_m_per_s: Annotated[float, Meta(gt=0)] = 4.0
     lost_sigma_m: Annotated[float, Meta(gt=0)] = 150.0
     jump_m: Annotated[float, Meta(gt=0)] = 5.0
 
@@ -180,18 +189,23 @@ class Tracker:
             and np.isfinite(odometry).all()
         )
         if not moved or odometry is None or anchor.odometry_ned_m is None:
-            sigma_m = options.unaided_speed_m_per_s * elapsed_s
-            return anchor.position_map_m, anchor.covariance + np.eye(3) * sigma_m**2
+            horizontal_m = options.unaided_speed_m_per_s * elapsed_s
+            vertical_m = options.unaided_climb_m_per_s * elapsed_s
+            return anchor.position_map_m, anchor.covariance + _axes(horizontal_m, vertical_m)
         step_ned = odometry - anchor.odometry_ned_m
         xy = anchor.position_map_m[:2]
         turn = frames.map_from_ned_rotation(self._georeference.convergence_rad(xy))
         step = turn @ step_ned
         step[:2] *= self._georeference.grid_scale(xy, float(anchor.position_map_m[2]))
         # A constant drift grows with time; a scale or heading error grows with the distance.
-        sigma_m = math.hypot(
+        horizontal_m = math.hypot(
             options.odometry_ratio * float(np.linalg.norm(step)), options.odometry_drift_m_per_s * elapsed_s
         )
-        return anchor.position_map_m + step, anchor.covariance + np.eye(3) * sigma_m**2
+        vertical_m = math.hypot(
+            options.climb_ratio * float(step[2]),
+            options.climb_error_m_per_s * _wandered_s(elapsed_s, options.climb_memory_s),
+        )
+        return anchor.position_map_m + step, anchor.covariance + _axes(horizontal_m, vertical_m)
 
     def announce_jump(self) -> None:
         """The next estimate starts anew for the autopilot: its origin moved, or it restarted."""
@@ -211,7 +225,7 @@ class Tracker:
         # A NaN sigma would pass for the most certain position of all.
         if position is None or not (np.isfinite(position).all() and np.isfinite(sigma_m).all()):
             return
-        covariance = np.diag(np.square([sigma_m[0], sigma_m[0], sigma_m[1]]))
+        covariance = _axes(*sigma_m)
         carried = self._carried(state)
         if carried is not None and self._anchor is not None:
             if _sigma(carried[1]) <= _sigma(covariance):
@@ -226,6 +240,20 @@ def _anchor(state: VehicleState, position: FloatArray, covariance: FloatArray, f
     odometry = state.odometry_ned_m
     usable = odometry is not None and bool(np.isfinite(odometry).all())
     return _Anchor(state.stamp_ns, position, covariance, odometry if usable else None, state.odometry_epoch, from_fix)
+
+
+def _wandered_s(elapsed_s: float, memory_s: float) -> float:
+    """1-sigma of the integral, over ``elapsed_s``, of an error of unit size that is forgotten after ``memory_s``.
+
+    The variance of an integrated first-order Gauss-Markov process: the time itself at first, its root in the end.
+    """
+    forgotten = -memory_s * math.expm1(-elapsed_s / memory_s)
+    return math.sqrt(2.0 * memory_s * max(elapsed_s - forgotten, 0.0))
+
+
+def _axes(horizontal_m: float, vertical_m: float) -> FloatArray:
+    """(3, 3) of 1-sigmas."""
+    return np.diag(np.square([horizontal_m, horizontal_m, vertical_m]))
 
 
 def _sigma(covariance: FloatArray) -> float:

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scenes_pipeline import fix
 from strategies import finite
 
@@ -113,17 +114,52 @@ def test_certainty_falls_with_distance_and_time():
         made.predict(s) for s in (state(0, (0, 0, 0)), state(10, (0, 0, 0)), state(0, (30, 40, 0)))
     )
     assert np.allclose(sigma_of(still), 0.5, atol=0.01)
-    assert np.allclose(sigma_of(later), np.hypot(0.5, 5.0))
-    assert np.allclose(sigma_of(farther), np.hypot(0.5, 2.0))
+    assert np.allclose(sigma_of(later)[:2], np.hypot(0.5, 5.0))
+    assert np.allclose(sigma_of(farther)[:2], np.hypot(0.5, 2.0))
     both = made.predict(state(10, (30, 40, 0)))
-    assert np.allclose(sigma_of(both), np.sqrt(0.25 + 25 + 4))
+    assert np.allclose(sigma_of(both)[:2], np.sqrt(0.25 + 25 + 4))
+
+
+def test_certainty_of_height_falls_with_the_climb_and_with_the_root_of_time():
+    made = fixed(climb_ratio=0.1, climb_error_m_per_s=0.3, climb_memory_s=2.0)
+    climbed = made.predict(state(0, (30, 40, -60)))
+    assert sigma_of(climbed)[2] == pytest.approx(np.hypot(0.5, 6.0))
+    assert sigma_of(made.predict(state(0.01, (0, 0, 0))))[2] == pytest.approx(np.hypot(0.5, 0.003), rel=1e-5)
+    # After long: a walk of 0.3 m/s times the root of twice the memory times the time.
+    assert sigma_of(made.predict(state(400, (0, 0, 0))))[2] == pytest.approx(np.sqrt(0.25 + 0.09 * 4 * 398), rel=1e-6)
+
+
+@settings(max_examples=10)
+@given(st.floats(0.2, 20.0), st.integers(0, 2**32 - 1))
+def test_height_drifts_as_an_error_that_is_forgotten_does(memory_s, seed):
+    """Against a Gauss-Markov process drawn and summed up."""
+    rng = np.random.default_rng(seed)
+    step_s, steps, flights = memory_s / 20, 120, 4000
+    keep = np.exp(-step_s / memory_s)
+    error = rng.standard_normal(flights)
+    drift = np.zeros(flights)
+    for _ in range(steps):
+        before, error = error, keep * error + np.sqrt(1 - keep**2) * rng.standard_normal(flights)
+        drift += step_s * (before + error) / 2
+    made = fixed(climb_error_m_per_s=1.0, climb_memory_s=memory_s)
+    variance = sigma_of(made.predict(state(steps * step_s, (0, 0, 0))))[2] ** 2 - 0.25
+    assert variance == pytest.approx(np.mean(drift**2), rel=0.15, abs=1e-4)
+
+
+def test_heights_of_another_datum_are_told_in_a_long_outage():
+    """Five minutes without a fix: in the horizontal nearly anything is believed, but not 50 m of height."""
+    prior = fixed().predict(state(300, (1500, 1500, 0)))
+    east, _, up = sigma_of(prior)
+    assert 5 * east > 300
+    assert 5 * up < 50
 
 
 def test_without_odometry_it_stays_and_grows_by_speed():
     made = fixed(unaided_speed_m_per_s=20.0)
     prior = made.predict(state(3))
     assert np.allclose(prior.map_from_camera.translation, (0, 0, 100))
-    assert np.allclose(sigma_of(prior), np.hypot(0.5, 60.0))
+    assert np.allclose(sigma_of(prior)[:2], np.hypot(0.5, 60.0))
+    assert sigma_of(prior)[2] == pytest.approx(np.hypot(0.5, 3 * 4.0))
 
 
 @pytest.mark.parametrize("broken", [{"epoch": 2}, {"odometry": (np.nan, 0, 0)}])
@@ -131,7 +167,7 @@ def test_a_broken_odometry_is_none(broken):
     made = fixed(unaided_speed_m_per_s=20.0)
     prior = made.predict(state(3, **{"odometry": (500.0, 0, 0), **broken}))
     assert np.allclose(prior.map_from_camera.translation, (0, 0, 100))
-    assert np.allclose(sigma_of(prior), np.hypot(0.5, 60.0))
+    assert np.allclose(sigma_of(prior)[:2], np.hypot(0.5, 60.0))
 
 
 def test_the_surer_of_gnss_and_carried_fix_is_taken():

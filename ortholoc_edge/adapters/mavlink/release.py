@@ -47,7 +47,8 @@ from ortholoc_edge.geometry.arrays import FloatArray
 
 _MS, _S = 1_000_000, 1_000_000_000
 
-# Error of the displacement: the tracker's defaults, for the same odometry.
+# Error of the displacement: the tracker's defaults of the horizontal, for the same odometry. Here it spans no more than
+# the time of a fix, in which a barometer tells the vertical no better.
 _ODOMETRY_RATIO = 0.03
 _ODOMETRY_DRIFT_M_PER_S = 0.2
 # The tracker's, too: where the autopilot tells no velocity, a vehicle in the air may fly as fast.
