@@ -15,6 +15,7 @@ from msgspec import Meta, Struct, field
 
 from ortholoc_edge.adapters.bus import BusOptions
 from ortholoc_edge.adapters.camera import CameraOptions
+from ortholoc_edge.adapters.flight_log import LogOptions
 from ortholoc_edge.adapters.mavlink import GimbalSelection, LinkOptions
 from ortholoc_edge.errors import ConfigError
 from ortholoc_edge.geometry import frames, rotation
@@ -174,13 +175,6 @@ class AttitudeOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     )
 
 
-class LogOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where every outcome is written as a line of JSON; nowhere if ``folder`` is left out."""
-
-    folder: Annotated[str, Meta(min_length=1)] | None = None
-    max_mb: Annotated[int, Meta(ge=1)] = 256
-
-
 class Config(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The whole file; tables are described at their classes and in config/example.toml."""
 
@@ -219,6 +213,16 @@ def read_config(path: Path) -> Config:
         raise ConfigError(f"{path}: {err}; see config/example.toml for what is allowed") from err
     _raise_first(path, _contradictions(config))
     return config
+
+
+def config_text(config: Config) -> str:
+    """As JSON, for `config_from_text`; infinite numbers, which only programs set, are written as Infinity."""
+    return json.dumps(msgspec.to_builtins(config))
+
+
+def config_from_text(text: str) -> Config:
+    """Raises: ValueError (of which msgspec's errors are)."""
+    return msgspec.convert(json.loads(text), Config)
 
 
 def _raise_first(path: Path, problems: Iterator[str]) -> None:

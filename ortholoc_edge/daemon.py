@@ -1,7 +1,7 @@
 """The program that flies: threads, hand-overs, supervision, shutdown.
 
     capture thread ──LatestSlot──▶ worker (the caller's thread): state at exposure → Navigator.step → estimate
-    link thread    ◀──────────── estimates, status      recorder and bus: bounded, drop and count
+    link thread    ◀──────────── estimates, status      flight log and bus: bounded, drop and count
 
 Frames never queue: a position three frames old misleads by an amount that nobody sees.
 """
@@ -20,16 +20,16 @@ from typing import Generic, TypeVar
 from ortholoc_edge.adapters import systemd
 from ortholoc_edge.adapters.bus import Bus
 from ortholoc_edge.adapters.camera import BadFrameError, EndOfFrames, FrameSource, open_source
+from ortholoc_edge.adapters.flight_log import FlightLog
 from ortholoc_edge.adapters.mavlink import AutopilotLink, Statistic, SystemStatus
-from ortholoc_edge.adapters.recorder import Recorder
-from ortholoc_edge.clock import Clock, SystemClock
-from ortholoc_edge.config import Config
+from ortholoc_edge.clock import Clock, SystemClock, wall_clock_ns
+from ortholoc_edge.config import Config, MatcherOptions, config_text
 from ortholoc_edge.errors import CameraError, LinkError, MapError, OrtholocError
 from ortholoc_edge.matching.registry import make_method
 from ortholoc_edge.matching.types import STRUCTURAL, AnyMatcher
 from ortholoc_edge.pipeline.frame import Frame, VehicleState
 from ortholoc_edge.pipeline.localizer import Localizer
-from ortholoc_edge.pipeline.navigator import Navigator
+from ortholoc_edge.pipeline.navigator import Circumstances, Navigator
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.tracker import Tracker
 from ortholoc_edge.pose import pnp
@@ -81,11 +81,13 @@ class Localized:
 
     Attributes:
         state: of the vehicle at the exposure, as it was known then.
+        circumstances: what else the outcome depended on.
     """
 
     frame: Frame
     outcome: Outcome
     state: VehicleState
+    circumstances: Circumstances
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,33 +136,21 @@ class Daemon:
             )
             georeference = self._store.pack.georeference
             _require_flyable(georeference, config.map.pack)
-            options = config.matcher
-            self._matcher = matcher or make_method(
-                options.name,
-                working_px=options.working_px,
-                max_keypoints=options.max_keypoints,
-                threads=options.threads,
-                model_path=None if options.model is None else Path(options.model),
-                model_sha256=options.model_sha256,
-            )
-            localizer = Localizer(config.intrinsics.camera(), self._store, self._matcher, config.localizer)
-            resources.callback(localizer.close)
+            self._matcher = matcher or configured_matcher(config.matcher)
             # In every life of the program another value, or the autopilot would not notice the restart.
             first_reset_counter = self._clock.now_ns() // _S
+            self._navigator = make_navigator(
+                config, self._store, self._matcher, first_reset_counter, config.timing.budget_ms
+            )
+            resources.callback(self._navigator.localizer.close)
             gimbal = config.mount.gimbal_selection()
-            fixed = config.mount.body_from_camera() if gimbal is None else None
-            tracker = Tracker(georeference, fixed, config.tracker, first_reset_counter, config.witness)
-            self._navigator = Navigator(localizer, tracker, config.timing.budget_ms)
             self._link = AutopilotLink(config.link, self._clock, gimbal, config.timing.max_age_ms)
+            tracker = self._navigator.tracker
             self._vehicle = Vehicle(
                 self._link, tracker, georeference, config.mount, config.attitude, self._clock, self._counts
             )
             bus = resources.enter_context(closing(Bus(config.bus))) if config.bus.enabled else None
-            recorder = (
-                resources.enter_context(closing(Recorder(Path(config.log.folder), config.log.max_mb)))
-                if config.log.folder
-                else None
-            )
+            log = resources.enter_context(closing(self._flight_log(config))) if config.log.folder else None
             self._reporter = Reporter(
                 self._link,
                 config.link,
@@ -170,7 +160,7 @@ class Daemon:
                 self._store,
                 self._counts,
                 bus=bus,
-                recorder=recorder,
+                log=log,
                 on_outcome=on_outcome,
             )
             self._frames = resources.enter_context(closing(frames or open_source(config.camera, self._clock)))
@@ -179,6 +169,24 @@ class Daemon:
         self._ended = threading.Event()
         self._capture_failure: BaseException | None = None
         self._capture_beat_ns = self._clock.now_ns()
+
+    def _flight_log(self, config: Config) -> FlightLog:
+        # A clock that somebody sets, in simulation, is its own date.
+        real = isinstance(self._clock, SystemClock)
+        now_ns = self._clock.now_ns()
+        return FlightLog(
+            config.log,
+            self._store.pack.georeference,
+            {
+                "config": config_text(config),
+                "pack": config.map.pack,
+                "pack_sha256": self._store.pack.manifest_sha256,
+                "matcher": self._matcher.name,
+                "model_sha256": self._matcher.model_sha256,
+            },
+            started_ns=now_ns,
+            unix_minus_stamp_ns=wall_clock_ns() - now_ns if real else 0,
+        )
 
     @property
     def link(self) -> AutopilotLink:
@@ -319,7 +327,9 @@ class Daemon:
             proceed: see `Localizer.localize`.
         """
         state = self._vehicle.at(frame.stamp_ns, stop)
-        return Localized(frame, self._navigator.step(frame, state, proceed), state)
+        outcome = self._navigator.step(frame, state, proceed)
+        assert self._navigator.last is not None
+        return Localized(frame, outcome, state, self._navigator.last)
 
     def settle(self, localized: Localized) -> Outcome:
         """Send and publish it; returns the outcome, which is a rejection where a fix came too late to be sent."""
@@ -332,11 +342,35 @@ class Daemon:
                 outcome = replace(late, timings_ms=outcome.timings_ms)
             else:
                 self._vehicle.tell(outcome, localized.state)
-        self._reporter.publish(frame, outcome)
+        self._reporter.publish(frame, outcome, (localized.outcome, localized.state, localized.circumstances))
         return outcome
 
     def _age_ms(self, stamp_ns: int) -> float:
         return (self._clock.now_ns() - stamp_ns) / 1e6
+
+
+def configured_matcher(options: MatcherOptions) -> AnyMatcher:
+    """Raises: ModelError, ConfigError."""
+    return make_method(
+        options.name,
+        working_px=options.working_px,
+        max_keypoints=options.max_keypoints,
+        threads=options.threads,
+        model_path=None if options.model is None else Path(options.model),
+        model_sha256=options.model_sha256,
+    )
+
+
+def make_navigator(
+    config: Config, store: MapStore, matcher: AnyMatcher, first_reset_counter: int, budget_ms: float | None
+) -> Navigator:
+    """Localizer and tracker as configured; the caller closes the localizer."""
+    fixed = config.mount.body_from_camera() if config.mount.gimbal_selection() is None else None
+    return Navigator(
+        Localizer(config.intrinsics.camera(), store, matcher, config.localizer),
+        Tracker(store.pack.georeference, fixed, config.tracker, first_reset_counter, config.witness),
+        budget_ms,
+    )
 
 
 def _require_flyable(georeference: Georeference, pack: str) -> None:

@@ -1,4 +1,4 @@
-"""What others are told of the flight: the autopilot, the ground station, the bus, the recorder, systemd and the log."""
+"""What others are told of the flight: the autopilot, the ground station, the bus, the flight log and systemd."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from collections.abc import Callable
 from ortholoc_edge.adapters import systemd
 from ortholoc_edge.adapters.bus import AutopilotRecord, Bus
 from ortholoc_edge.adapters.computer import ComputerReader
+from ortholoc_edge.adapters.flight_log import FlightLog, LoggedStep
 from ortholoc_edge.adapters.mavlink import AutopilotLink, LinkOptions, Severity, Statistic, SystemStatus
 from ortholoc_edge.adapters.mavlink.audit import Level
 from ortholoc_edge.adapters.mavlink.checkup import Checkup
 from ortholoc_edge.adapters.mavlink.herald import Herald
 from ortholoc_edge.adapters.mavlink.sources import SourceSwitch, Withheld
-from ortholoc_edge.adapters.recorder import Recorder
 from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.navigator import Navigator
 from ortholoc_edge.pipeline.outcome import Fix, Outcome
@@ -50,7 +50,7 @@ class Reporter:
         counts: Counter[str],
         *,
         bus: Bus | None = None,
-        recorder: Recorder | None = None,
+        log: FlightLog | None = None,
         on_outcome: OutcomeListener | None = None,
     ) -> None:
         """
@@ -61,7 +61,7 @@ class Reporter:
         """
         self._link, self._vehicle, self._navigator, self._store = link, vehicle, navigator, store
         self._options, self._counts = options, counts
-        self._bus, self._recorder, self._on_outcome = bus, recorder, on_outcome
+        self._bus, self._log, self._on_outcome = bus, log, on_outcome
         self._computer = ComputerReader()
         self._checkup: Checkup | None = Checkup(link, options, lever_arm_m=lever_arm_m, ages=link.ages)
         self._findings_told: set[str] = set()
@@ -73,7 +73,7 @@ class Reporter:
         self._origin_told_ns: int | None = None
 
     def statistics(self) -> dict[str, Statistic]:
-        """Counters since the start: the daemon's, the recorder's and the bus's drops, and the link's under ``link.``;
+        """Counters since the start: the daemon's, the log's and the bus's drops, and the link's under ``link.``;
         the rung of detail that frames are localized at, and whether GNSS agrees with the fixes."""
         witness = self._navigator.tracker.witness.report
         return {
@@ -83,18 +83,18 @@ class Reporter:
             "gnss_consistency": witness.state.value,
             "gnss_apart_m": witness.apart_m,
             "map_files_damaged": len(self._store.damaged),
-            "log_dropped": 0 if self._recorder is None else self._recorder.dropped,
+            "log_dropped": 0 if self._log is None else self._log.dropped,
             "bus_dropped": 0 if self._bus is None else self._bus.dropped,
             **{f"link.{name}": value for name, value in self._link.statistics().items()},
         }
 
-    def publish(self, frame: Frame | None, outcome: Outcome) -> None:
-        """What a frame came to."""
+    def publish(self, frame: Frame | None, outcome: Outcome, step: LoggedStep | None = None) -> None:
+        """What a frame came to. ``step``: see `FlightLog.put`."""
         if isinstance(outcome, Fix):
             self._last_fix_ns = outcome.stamp_ns
         self._counts["fixes" if isinstance(outcome, Fix) else "rejected"] += 1
-        if self._recorder is not None:
-            self._recorder.put(frame.name if frame is not None else None, outcome)
+        if self._log is not None:
+            self._log.put(frame, outcome, step)
         if self._bus is not None:
             self._bus.publish(outcome)
         if self._on_outcome is not None:
@@ -112,6 +112,8 @@ class Reporter:
         self._switch_sources(self._navigator.tracker.witness.report.state, now_ns)
         self._report_autopilot(now_ns)
         self._link.report_computer(self._computer.read())
+        if self._log is not None:
+            self._log.note(now_ns, self.statistics())
         counts = self._counts
         systemd.notify(f"STATUS={self._status(now_ns)}, {counts['fixes']} fixes, {counts['rejected']} rejected")
         if self._link.connected():

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from ortholoc_edge.bench import draw
+from ortholoc_edge.bench.flight_log import Comparison
 from ortholoc_edge.bench.metrics import Spread, Summary
 from ortholoc_edge.bench.replay import FrameResult
 from ortholoc_edge.errors import OrtholocError
@@ -91,6 +92,25 @@ def track_picture(store: MapStore, results: list[FrameResult], caption: str) -> 
 def rss_mb() -> float:
     """Peak resident memory of this process, MiB (Linux counts in KiB)."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+def comparison_table(c: Comparison) -> str:
+    """A flight log flown again, for people."""
+    rows = [
+        ("log", f"{c.files[0]}" + (f" and {len(c.files) - 1} more" if len(c.files) > 1 else "")),
+        ("written by", f"ortholoc-edge {c.version}"),
+        ("steps", f"{c.steps}, of which repeated {c.repeated} ({c.alone} from the recorded prediction)"),
+        ("fixes", f"{c.fixes} in flight"),
+        ("the same", f"{c.same} in every bit"),
+    ]
+    if c.left_out:
+        rows.append(("left out", f"{c.left_out}, the log has no picture without loss of them"))
+    if c.same != c.repeated:
+        furthest = "" if c.furthest_m is None else f", fixes up to {c.furthest_m:.4f} m apart"
+        rows.append(("different", f"{c.repeated - c.same}, {c.other_verdict} of them in the verdict{furthest}"))
+        rows.append(("the first", ", ".join(c.differ)))
+    width = max(len(name) for name, _ in rows)
+    return "\n".join(f"{name:<{width}}  {text}" for name, text in rows)
 
 
 def table(summary: Summary) -> str:

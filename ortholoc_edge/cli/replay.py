@@ -6,23 +6,24 @@ import argparse
 from collections.abc import Iterable
 from contextlib import nullcontext
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import msgspec
 from tqdm import tqdm
 
+from ortholoc_edge import __version__
 from ortholoc_edge.bench import report, sequence
 from ortholoc_edge.bench.draw import write_png
-from ortholoc_edge.bench.replay import (
-    FrameResult,
-    Length,
-    PriorKind,
-    PriorNoise,
-)
+from ortholoc_edge.bench.flight_log import compare, log_files, read_frames, read_header, repeat
+from ortholoc_edge.bench.replay import FrameResult, Length, PriorKind, PriorNoise
 from ortholoc_edge.bench.runner import SAMPLES_PACK, prior_used, run_flight, run_samples, summarise
 from ortholoc_edge.cli import matcher_options
 from ortholoc_edge.cli.arguments import length, non_negative, seed, sigma_triple, writable_folder
+from ortholoc_edge.config import config_from_text
+from ortholoc_edge.daemon import configured_matcher, make_navigator
 from ortholoc_edge.errors import ConfigError, DatasetError, OrtholocError
+from ortholoc_edge.matching.types import STRUCTURAL
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
 from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.store import MapStore
@@ -31,9 +32,12 @@ from ortholoc_edge.tiles.store import MapStore
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = subparsers.add_parser(
         "replay",
-        help="localize a recorded sequence and compare with its true poses",
+        help="localize a recorded sequence and compare with its true poses, or fly a flight log again",
         description="Feeds a recorded sequence through the pipeline that flies and compares with the true poses. "
-        "SEQUENCE is a folder of photos with a *_flight.csv, an OrthoLoC sample (.npz) or a folder of samples.",
+        "SEQUENCE is a folder of photos with a *_flight.csv, an OrthoLoC sample (.npz) or a folder of samples. Of a "
+        "flight log (.mcap, or a folder of them: the last flight there), which has no true poses, each outcome is "
+        "compared with that of the flight; pack and settings are the log's, of the options only --pack, --json and "
+        "--out go with it, and the exit code is 1 if anything came out differently.",
     )
     parser.add_argument("sequence", type=Path, metavar="SEQUENCE")
     parser.add_argument(
@@ -84,10 +88,58 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     matcher_options.add(parser)
     matcher_options.add_features(parser)
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, defaults={action.dest: action.default for action in parser._actions})
 
 
 def run(args: argparse.Namespace) -> int:
+    logs = log_files(args.sequence)
+    return _fly_again(logs, args) if logs else _replay(args)
+
+
+def _fly_again(logs: list[Path], args: argparse.Namespace) -> int:
+    for name, default in args.defaults.items():
+        if name not in ("help", "sequence", "pack", "json", "out") and getattr(args, name) != default:
+            raise ConfigError(f"--{name.replace('_', '-')} does not go with a flight log, whose own settings count")
+    header = read_header(logs[0])
+    try:
+        config = config_from_text(header.config)
+    except ValueError as err:
+        raise DatasetError(
+            f"{logs[0]}: its configuration, of version {header.version}, is not understood by {__version__} ({err}); "
+            "replay it with the version that wrote it"
+        ) from err
+    pack = Path(header.pack) if args.pack is None else args.pack
+    matcher = configured_matcher(config.matcher)
+    if args.out:
+        writable_folder(args.out, "--out")
+    features = config.localizer.precomputed_features != "never" and config.matcher.name != STRUCTURAL
+    with MapStore(Pack.open(pack), features=features) as store:
+        if store.pack.manifest_sha256 != header.pack_sha256:
+            raise DatasetError(
+                f"{pack}: not the pack that was flown with, its manifest differs; name that one with --pack"
+            )
+        navigator = make_navigator(config, store, matcher, 0, None)
+        try:
+            steps = chain.from_iterable(map(read_frames, logs))
+            found = list(tqdm(repeat(steps, navigator), desc=args.sequence.name, unit="frame"))
+        finally:
+            navigator.localizer.close()
+    comparison = compare(logs, header.version, found)
+    if not comparison.pictures:
+        raise DatasetError(
+            f"{args.sequence}: {len(found)} frames, none with a picture without loss; such logs are written with "
+            '[log] frames = "all"'
+        )
+    encoded = msgspec.json.encode(comparison)
+    if args.out:
+        taken = [one for one in found if one is not None]
+        _write(args.out / "frames.jsonl", b"".join(msgspec.json.encode(one) + b"\n" for one in taken))
+        _write(args.out / "summary.json", encoded + b"\n")
+    print(encoded.decode() if args.json else report.comparison_table(comparison))
+    return 0 if comparison.same == comparison.repeated else 1
+
+
+def _replay(args: argparse.Namespace) -> int:
     noise = PriorNoise(
         args.attitude_sigma_deg,
         (args.position_sigma, args.height_sigma),
@@ -139,12 +191,16 @@ def run(args: argparse.Namespace) -> int:
     )
     encoded = msgspec.json.encode(summary)
     if args.out:
-        try:
-            (args.out / "summary.json").write_bytes(encoded + b"\n")
-        except OSError as err:
-            raise OrtholocError(f"{args.out}: can't write summary.json ({err})") from err
+        _write(args.out / "summary.json", encoded + b"\n")
     print(encoded.decode() if args.json else report.table(summary))
     return 0
+
+
+def _write(path: Path, data: bytes) -> None:
+    try:
+        path.write_bytes(data)
+    except OSError as err:
+        raise OrtholocError(f"{path.parent}: can't write {path.name} ({err})") from err
 
 
 def _store(args: argparse.Namespace) -> MapStore:

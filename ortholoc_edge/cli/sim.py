@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     if args.scenario:
         return sim_scenarios.fly_scenarios(args)
     for option, given in (("--short", args.short), ("--without-fixes", args.without_fixes), ("--seeds", args.seeds > 1),
-                          ("--packs", args.packs is not None)):  # fmt: skip
+                          ("--packs", args.packs is not None), ("--flight-log", args.flight_log)):  # fmt: skip
         if given:
             raise ConfigError(f"{option} is of scenarios; name one with --scenario, or leave it out")
     # Not at the top: every other command works without the simulation.

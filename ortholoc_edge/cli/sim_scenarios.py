@@ -55,6 +55,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--without-fixes", action="store_true", help="show what becomes of the flight without us; nothing is expected"
     )
     group.add_argument(
+        "--flight-log",
+        action="store_true",
+        help="keep the daemon's log of each flight in OUT/NAME/seed-N/log, for ortholoc-edge replay: 0.2 MB a frame",
+    )
+    group.add_argument(
         "--packs", type=Path, metavar="DIR", help="where map packs are kept from run to run (default: OUT/packs)"
     )
 
@@ -104,7 +109,7 @@ def _flown(args: argparse.Namespace) -> int:
                 def tell(now_s: float, bar: tqdm[None] = bar) -> None:
                     bar.update(now_s - bar.n)
 
-                flown = fly(scenario, seed, packs, tell)
+                flown = fly(scenario, seed, packs, tell, folder / "log" if args.flight_log else None)
             judged = judge(flown)
             write_files(judged, folder)
             write_page(judged, folder / "report.html")

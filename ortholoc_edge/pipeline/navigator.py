@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Annotated
 
 from msgspec import Meta, Struct
@@ -28,13 +29,30 @@ class TimingOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     budget_ms: Annotated[float, Meta(gt=0)] = 200.0
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Circumstances:
+    """What a step depended on besides its frame, its state and the steps before: with these it can be taken again.
+
+    Attributes:
+        prior: the prediction; None where there was none.
+        rung: of detail.
+        proceeded: how often it was told to go on before it was told to stop, or did not ask any more.
+        reset_counter: the tracker's before the step; others may raise it between steps.
+    """
+
+    prior: PosePrior | None
+    rung: int
+    proceeded: int
+    reset_counter: int
+
+
 class Navigator:
     """Localizer and tracker as one; used by one thread.
 
     Attributes:
         localizer, tracker: the two.
         ladder: how much detail there is time for.
-        prior: the prediction for the last frame; None if there was none.
+        last: what the last step depended on; None before the first.
     """
 
     def __init__(self, localizer: Localizer, tracker: Tracker, budget_ms: float | None = None) -> None:
@@ -46,19 +64,61 @@ class Navigator:
         self.localizer = localizer
         self.tracker = tracker
         self.ladder = Ladder(localizer.rungs, budget_ms)
-        self.prior: PosePrior | None = None
+        self.last: Circumstances | None = None
+
+    @property
+    def prior(self) -> PosePrior | None:
+        """The prediction for the last frame; None if there was none."""
+        return None if self.last is None else self.last.prior
 
     def step(self, frame: Frame, state: VehicleState, proceed: Callable[[], bool] = lambda: True) -> Outcome:
         """What the frame comes to, given the vehicle's state at its exposure. ``proceed``: see `Localizer.localize`."""
+        rung = self.ladder.rung
+        outcome = self._step(frame, state, proceed, rung)
+        # Only what a rung can change; and a frame that was refused before anything was matched took no time.
+        if "match" in outcome.timings_ms and "structural" in outcome.timings_ms:
+            self.ladder.note(outcome.timings_ms["structural"])
+        return outcome
+
+    def step_again(self, frame: Frame, state: VehicleState, was: Circumstances) -> Outcome:
+        """A recorded step, after those before it: the same outcome, however fast this computer is."""
+        self.tracker.reset_counter = was.reset_counter
+        return self._step(frame, state, _yes(was.proceeded), was.rung)
+
+    def _step(self, frame: Frame, state: VehicleState, proceed: Callable[[], bool], rung: int) -> Outcome:
+        reset_counter, proceeded = self.tracker.reset_counter, 0
+
+        def counted() -> bool:
+            nonlocal proceeded
+            on = proceed()
+            proceeded += on
+            return on
+
         predicted = self.tracker.predict(state)
         outcome: Outcome
         if isinstance(predicted, Rejected):
-            self.prior, outcome = None, predicted
+            prior, outcome = None, predicted
         else:
-            self.prior = predicted
-            outcome = self.localizer.localize(frame, predicted, proceed, self.ladder.rung)
-            # Only what a rung can change; and a frame that was refused before anything was matched took no time.
-            if "match" in outcome.timings_ms and "structural" in outcome.timings_ms:
-                self.ladder.note(outcome.timings_ms["structural"])
+            prior, outcome = predicted, self.localizer.localize(frame, predicted, counted, rung)
+        self.last = Circumstances(prior, rung, proceeded, reset_counter)
         self.tracker.update(outcome, state)
         return outcome
+
+
+def localize_again(localizer: Localizer, frame: Frame, was: Circumstances) -> Outcome | None:
+    """A recorded step without those before it, from the prediction that it had; None if it had none."""
+    if was.prior is None:
+        return None
+    return localizer.localize(frame, was.prior, _yes(was.proceeded), was.rung)
+
+
+def _yes(times: int) -> Callable[[], bool]:
+    """Go on so often, then stop."""
+    left = times
+
+    def proceed() -> bool:
+        nonlocal left
+        left -= 1
+        return left >= 0
+
+    return proceed

@@ -1,11 +1,19 @@
-"""Outcomes as plain values, for JSON: in results, in the log and on the bus alike."""
+"""Outcomes and steps as plain values, for JSON: in results, in the log and on the bus alike."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+from msgspec import Struct
+
 from ortholoc_edge.geometry import rotation
+from ortholoc_edge.geometry.arrays import FloatArray
+from ortholoc_edge.geometry.rigid import Rigid3
+from ortholoc_edge.pipeline.frame import CameraMount, VehicleState
+from ortholoc_edge.pipeline.navigator import Circumstances
 from ortholoc_edge.pipeline.outcome import Fix, Outcome
+from ortholoc_edge.pipeline.prior import PosePrior
 
 
 def outcome_record(outcome: Outcome) -> dict[str, Any]:
@@ -38,3 +46,96 @@ def outcome_record(outcome: Outcome) -> dict[str, Any]:
         "focal_sigma_px": outcome.focal_sigma_px,
         "timings_ms": outcome.timings_ms,
     }
+
+
+class FrameRecord(Struct, frozen=True, kw_only=True):
+    """A step as it was taken: all that it depended on but the picture, and what it came to.
+
+    Frames and units are those of `VehicleState`, `PosePrior` and `Circumstances`; null stands for a number that was
+    not finite.
+
+    Attributes:
+        sequence: of the steps of one life of the daemon, from 0.
+        whole: whether the picture beside it is without loss.
+        mount: the gimbal's ``body_from_camera`` as (3, 4) and its sigmas; None of a fixed one.
+        outcome: `outcome_record`, before its age was looked at.
+    """
+
+    sequence: int
+    name: str
+    stamp_ns: int
+    whole: bool
+    ned_from_body: list[list[float | None]] | None
+    attitude_sigma_rad: list[float | None]
+    odometry_ned_m: list[float | None] | None
+    odometry_epoch: int
+    position_map_m: list[float | None] | None
+    position_sigma_m: list[float | None]
+    mount: tuple[list[list[float]], list[float]] | None
+    no_attitude_because: str
+    prior_map_from_camera: list[list[float]] | None
+    prior_covariance: list[list[float]] | None
+    rung: int
+    proceeded: int
+    reset_counter: int
+    outcome: dict[str, Any]
+
+    def state(self) -> VehicleState:
+        return VehicleState(
+            self.stamp_ns,
+            None if self.ned_from_body is None else _floats(self.ned_from_body),
+            tuple(_floats(self.attitude_sigma_rad).tolist()),
+            None if self.odometry_ned_m is None else _floats(self.odometry_ned_m),
+            self.odometry_epoch,
+            None if self.position_map_m is None else _floats(self.position_map_m),
+            tuple(_floats(self.position_sigma_m).tolist()),
+            None if self.mount is None else CameraMount(_rigid(self.mount[0]), (self.mount[1][0], self.mount[1][1])),
+            self.no_attitude_because,
+        )
+
+    def circumstances(self) -> Circumstances:
+        prior = None
+        if self.prior_map_from_camera is not None and self.prior_covariance is not None:
+            prior = PosePrior(_rigid(self.prior_map_from_camera), _floats(self.prior_covariance))
+        return Circumstances(prior, self.rung, self.proceeded, self.reset_counter)
+
+
+def frame_record(
+    sequence: int, name: str, outcome: Outcome, state: VehicleState, circumstances: Circumstances
+) -> FrameRecord:
+    """What `Navigator.step_again` needs."""
+    prior, mount = circumstances.prior, state.mount
+    return FrameRecord(
+        sequence=sequence,
+        name=name,
+        stamp_ns=state.stamp_ns,
+        whole=False,
+        ned_from_body=None if state.ned_from_body is None else state.ned_from_body.tolist(),
+        attitude_sigma_rad=list(state.attitude_sigma_rad),
+        odometry_ned_m=None if state.odometry_ned_m is None else state.odometry_ned_m.tolist(),
+        odometry_epoch=state.odometry_epoch,
+        position_map_m=None if state.position_map_m is None else state.position_map_m.tolist(),
+        position_sigma_m=list(state.position_sigma_m),
+        mount=None if mount is None else (_matrix(mount.body_from_camera), list(mount.sigma_rad)),
+        no_attitude_because=state.no_attitude_because,
+        prior_map_from_camera=None if prior is None else _matrix(prior.map_from_camera),
+        prior_covariance=None if prior is None else prior.covariance.tolist(),
+        rung=circumstances.rung,
+        proceeded=circumstances.proceeded,
+        reset_counter=circumstances.reset_counter,
+        outcome=outcome_record(outcome),
+    )
+
+
+def _matrix(pose: Rigid3) -> list[list[float]]:
+    return [[*row, shift] for row, shift in zip(pose.rotation.tolist(), pose.translation.tolist(), strict=True)]
+
+
+def _rigid(rows: list[list[float]]) -> Rigid3:
+    matrix = np.array(rows, dtype=np.float64)
+    return Rigid3(matrix[:, :3], matrix[:, 3])
+
+
+def _floats(values: Any) -> FloatArray:
+    """Null becomes NaN."""
+    return np.array(values, dtype=np.float64)

@@ -26,6 +26,7 @@ from ortholoc_edge.tiles.manifest import (
     Manifest,
     Tile,
     layer_box,
+    manifest_bytes,
     parse_manifest,
     read_manifest,
 )
@@ -54,6 +55,7 @@ class Pack:
         georeference: of the pack's map frame.
         missing: files that the manifest lists and that are not there, or not with the size it says.
         signed: whether a signature of the manifest was required and found.
+        manifest_sha256: of its bytes; they hold the checksums of all files, so it names the pack's content.
     """
 
     path: Path
@@ -61,6 +63,7 @@ class Pack:
     georeference: Georeference
     missing: frozenset[str] = frozenset()
     signed: bool = False
+    manifest_sha256: str = ""
 
     @staticmethod
     def open(path: Path, public_key: Path | None = None) -> Pack:
@@ -74,7 +77,8 @@ class Pack:
         """
         file = path / MANIFEST_NAME
         # What is parsed are the bytes that were verified, not those of a second look at the file.
-        manifest = read_manifest(file) if public_key is None else parse_manifest(require(path, public_key), file)
+        raw = manifest_bytes(file) if public_key is None else require(path, public_key)
+        manifest = parse_manifest(raw, file)
         problems = {}
         for note in manifest.notes():
             try:
@@ -94,7 +98,8 @@ class Pack:
             georeference = Georeference(manifest.crs, manifest.vertical, manifest.anchor, _offsets(manifest.dsm))
         except ValueError as err:
             raise MapError(f"{path / MANIFEST_NAME}: {err}; rebuild the pack or copy it again") from err
-        return Pack(path, manifest, georeference, frozenset(problems), signed=public_key is not None)
+        sha256 = hashlib.sha256(raw).hexdigest()
+        return Pack(path, manifest, georeference, frozenset(problems), public_key is not None, sha256)
 
     @property
     def total_bytes(self) -> int:

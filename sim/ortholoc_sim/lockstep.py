@@ -20,6 +20,7 @@ import numpy as np
 import rasterio
 
 from ortholoc_edge.adapters.camera import CameraOptions
+from ortholoc_edge.adapters.flight_log import LogOptions
 from ortholoc_edge.adapters.mavlink.codec import FrameParser, dialect
 from ortholoc_edge.clock import ManualClock
 from ortholoc_edge.config import Config, MapOptions
@@ -57,6 +58,8 @@ _ARRIVED_M = 15.0
 # z of the 99th percentile of a normal distribution.
 _P99 = 2.3263
 _SMEARS_FROM_MS = 0.5
+# More than any flight has; the disk's owner asked for the log.
+_LOG_MB = 16_384
 _KEPT_PICTURES, _KEPT_REFUSED = 6, 6
 
 
@@ -116,16 +119,23 @@ class Flown:
         return (self.loop.now_ns - START_NS) / _S
 
 
-def fly(scenario: Scenario, seed: int, folder: Path, progress: Callable[[float], None] = lambda _: None) -> Flown:
+def fly(
+    scenario: Scenario,
+    seed: int,
+    folder: Path,
+    progress: Callable[[float], None] = lambda _: None,
+    log: Path | None = None,
+) -> Flown:
     """Fly ``scenario`` once.
 
     Args:
         seed: of sensor errors, gusts, noise, latencies and losses. The world's is the scenario's.
         folder: where packs are kept.
         progress: told the simulated seconds so far.
+        log: folder for the daemon's flight log, which can be replayed.
     Raises: OrtholocError for what the daemon can't work with.
     """
-    return _Flight(scenario, seed, folder).run(progress)
+    return _Flight(scenario, seed, folder, log).run(progress)
 
 
 class _Camera:
@@ -282,8 +292,9 @@ class _Worker:
 
 
 class _Flight:
-    def __init__(self, scenario: Scenario, seed: int, folder: Path) -> None:
+    def __init__(self, scenario: Scenario, seed: int, folder: Path, log: Path | None) -> None:
         self.scenario, self.seed = scenario, seed
+        self._log = LogOptions(folder=None if log is None else str(log), max_mb=_LOG_MB, frames="all")
         self._pack = pack_for(scenario, folder)
         self._grounds = make_grounds(scenario.world, scenario.map.kind)
         site = self._grounds.site
@@ -445,6 +456,7 @@ class _Flight:
             attitude=scenario.attitude,
             # No budget: the ladder of detail goes by wall time, which is not the same twice.
             timing=TimingOptions(max_age_ms=scenario.timing.max_age_ms, budget_ms=math.inf),
+            log=self._log,
         )
 
 

@@ -26,14 +26,16 @@ import pytest
 from adapters.fake_autopilot import PtyWire, UdpWire, Wire, dialect
 from adapters.firmware_parameters import ARDUPILOT_READY, ARDUPILOT_STOCK
 from adapters.hovering import PITCH, PLACE, ROLL, TRUE_NED, TRUTH, YAW, HoveringAutopilot, config, running, wait_for
+from mcap.reader import make_reader
 from replay import rendered
 
 from ortholoc_edge.adapters import systemd
 from ortholoc_edge.adapters.bus import AutopilotRecord
 from ortholoc_edge.adapters.camera import CameraOptions, EndOfFrames, FrameSource, open_source
+from ortholoc_edge.adapters.flight_log import LogOptions
 from ortholoc_edge.adapters.mavlink import SystemStatus
 from ortholoc_edge.clock import SystemClock
-from ortholoc_edge.config import Config, LogOptions, MountOptions
+from ortholoc_edge.config import Config, MountOptions
 from ortholoc_edge.daemon import Daemon, LatestSlot
 from ortholoc_edge.errors import CameraError, LinkError, MapError, OrtholocError
 from ortholoc_edge.geometry import frames, rotation
@@ -132,7 +134,12 @@ def test_folder_to_autopilot(folder: Path, peer: tuple[HoveringAutopilot, str], 
     assert stamps == sorted(stamps)
     counts = daemon.statistics()
     assert counts["fixes"] + counts["rejected"] == len(outcomes)
-    logged = [msgspec.json.decode(line) for line in (tmp_path / "outcomes.jsonl").read_bytes().splitlines()]
+    (log,) = tmp_path.glob("flight-*.mcap")
+    with log.open("rb") as file:
+        logged = [
+            msgspec.json.decode(message.data)
+            for _, _, message in make_reader(file).iter_messages(topics=["/ortholoc/outcome"])
+        ]
     assert [line["stamp_ns"] for line in logged] == stamps
     assert [line["fix"] for line in logged] == [isinstance(outcome, Fix) for _, outcome in outcomes]
 
@@ -510,7 +517,7 @@ def test_end_of_the_frames_ends_the_daemon(tmp_path: Path) -> None:
     # Nobody answers, so there is no attitude.
     assert [o.reason for o in outcomes if isinstance(o, Rejected)] == [Reason.BAD_ATTITUDE] * len(outcomes)
     assert outcomes
-    assert not [t for t in threading.enumerate() if t.name in ("capture", "recorder", "mavlink")]
+    assert not [t for t in threading.enumerate() if t.name in ("capture", "flight-log", "mavlink")]
 
 
 class BankedAutopilot(HoveringAutopilot):

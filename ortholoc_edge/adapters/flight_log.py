@@ -1,0 +1,504 @@
+"""The flight as a file: MCAP, which Foxglove opens and ``ortholoc-edge replay`` flies again.
+
+    /camera              foxglove.CompressedImage   the frame: a thumbnail, or all of it without loss
+    /fix                 foxglove.LocationFix       the camera on WGS 84, of each fix that was sent or published
+    /pose                foxglove.PoseInFrame       map_from_camera, from the pack's anchor
+    /ortholoc/frame      ortholoc.Frame             what the step to the outcome depended on, and the outcome
+    /ortholoc/outcome    ortholoc.Outcome           as published: a fix that came too late is a rejection here
+    /ortholoc/health     ortholoc.Health            counters, once a second
+
+A thread of its own writes: the frame path never waits for it. Each file is whole by itself and begins with a metadata
+record ``ortholoc`` (`LogHeader`). Chunks are small, each is handed to the system at once and the disk is told once a
+second to keep them, so that a power cut costs a second; what was cut off can be read up to there.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import datetime
+import json
+import logging
+import os
+import queue
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from io import BufferedWriter
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import cv2
+import msgspec
+import numpy as np
+from mcap.writer import Writer
+from msgspec import Meta, Struct
+
+from ortholoc_edge import __version__
+from ortholoc_edge.errors import OrtholocError
+from ortholoc_edge.geometry import covariance as cov
+from ortholoc_edge.geometry import frames, rotation
+from ortholoc_edge.geometry.arrays import ImageArray
+from ortholoc_edge.pipeline.frame import Frame, VehicleState
+from ortholoc_edge.pipeline.navigator import Circumstances
+from ortholoc_edge.pipeline.outcome import Fix, Outcome
+from ortholoc_edge.pipeline.record import FrameRecord, frame_record, outcome_record
+from ortholoc_edge.tiles.georeference import Georeference
+
+logger = logging.getLogger(__name__)
+
+HEADER_NAME = "ortholoc"
+FRAME_TOPIC, CAMERA_TOPIC = "/ortholoc/frame", "/camera"
+_S = 1_000_000_000
+
+# Frames without loss are of a megabyte, and a disk that hangs must not fill the memory.
+_QUEUE_LENGTH = 24
+_CLOSE_WAIT_S = 5.0
+_SYNC_EVERY_NS = 1 * _S
+# Where a file could not be written, the next is tried this long after.
+_AGAIN_AFTER_NS = 1 * _S
+# A chunk ends with the message that takes it beyond this, which is what can be read after a power cut. The record of a
+# frame, its last message, and a second's counters are longer by their names alone.
+_CHUNK_BYTES = 256
+# Of the limit; so much is lost at once when the oldest file goes.
+_FILES_OF_LIMIT = 8
+_THUMBNAIL_PX, _THUMBNAIL_QUALITY = 320, 70
+_ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+_FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+
+
+class LogOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The ``[log]`` table.
+
+    Attributes:
+        folder: for flight logs; none are written if it is left out.
+        max_mb: of all logs in the folder; the oldest go.
+        frames: "thumbnails", "all" (without loss, in grey, as they were localized: what a replay needs; 0.2 MB and 4 ms
+            of another core's time each at 640x480) or "none".
+    """
+
+    folder: Annotated[str, Meta(min_length=1)] | None = None
+    max_mb: Annotated[int, Meta(ge=1)] = 256
+    frames: Literal["thumbnails", "all", "none"] = "thumbnails"
+
+
+class LogHeader(Struct, frozen=True, kw_only=True):
+    """The metadata record: whose flight this is, and all that does not change in it.
+
+    Attributes:
+        version: of this program. libraries: that poses depend on.
+        session: the same in all files of one life of the daemon; part: their number, from 0.
+        config: the daemon's `Config` as JSON, where Infinity is allowed.
+        pack, pack_sha256: folder, and hash of the manifest, which has those of all files.
+        matcher, model_sha256: that were used.
+        unix_minus_stamp_ns: what makes dates of stamps; log times are dates.
+    """
+
+    version: str
+    libraries: dict[str, str]
+    session: str
+    part: int
+    config: str
+    pack: str
+    pack_sha256: str
+    matcher: str
+    model_sha256: str | None
+    unix_minus_stamp_ns: int
+
+
+# What a frame came to before its age was looked at, the vehicle's state at its exposure, and what else it depended on.
+LoggedStep = tuple[Outcome, VehicleState, Circumstances]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Entry:
+    """A frame on its way to the disk; `place` is latitude, longitude (deg) and height above the ellipsoid (m)."""
+
+    frame: Frame | None
+    record: FrameRecord | None
+    outcome: Outcome
+    place: tuple[float, float, float] | None
+
+
+class FlightLog:
+    """Writes ``FOLDER/flight-DATE-PART.mcap``.
+
+    What can't be written (a full disk, a slow card) is dropped and counted: logging must not end a flight.
+
+    Attributes:
+        dropped: frames not written.
+    Raises on construction: OrtholocError if the folder can't be written to.
+    """
+
+    def __init__(
+        self,
+        options: LogOptions,
+        georeference: Georeference,
+        header: Mapping[str, Any],
+        started_ns: int,
+        unix_minus_stamp_ns: int,
+    ) -> None:
+        """
+        Args:
+            options: with a folder.
+            header: of `LogHeader`, ``config``, ``pack``, ``pack_sha256``, ``matcher`` and ``model_sha256``.
+            started_ns: a stamp; its date is in the files' names.
+        """
+        assert options.folder is not None
+        self._folder, self._frames = Path(options.folder), options.frames
+        self._limit_bytes = options.max_mb * 2**20
+        self._georeference = georeference
+        self._offset_ns = unix_minus_stamp_ns
+        self._header = header
+        self.dropped = 0
+        self._part = 0
+        self._failing = False
+        self._failed_ns = 0
+        self._sequence = 0
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            self._session = self._free_session(started_ns + unix_minus_stamp_ns)
+            self._file: _File | None = self._open()
+        except OSError as err:
+            raise OrtholocError(f"{self._folder}: can't write the log there ({err}); see log.folder") from err
+        self._queue: queue.Queue[_Entry | tuple[int, bytes] | None] = queue.Queue(_QUEUE_LENGTH)
+        self._thread = threading.Thread(target=self._run, name="flight-log", daemon=True)
+        self._thread.start()
+
+    def put(
+        self,
+        frame: Frame | None,
+        outcome: Outcome,
+        step: LoggedStep | None = None,
+    ) -> None:
+        """Hand over what a frame came to; returns at once.
+
+        Args:
+            frame: its image must not change any more.
+            outcome: as published.
+            step: None where it was not localized.
+        """
+        record = None
+        if step is not None:
+            assert frame is not None
+            record = frame_record(self._sequence, frame.name, *step)
+            self._sequence += 1
+        self._hand_over(_Entry(frame, record, outcome, self._place(outcome)))
+
+    def note(self, stamp_ns: int, statistics: Mapping[str, Any]) -> None:
+        """Hand over the counters; returns at once."""
+        self._hand_over((stamp_ns, msgspec.json.encode({"stamp_ns": stamp_ns, "statistics": statistics})))
+
+    def _hand_over(self, entry: _Entry | tuple[int, bytes]) -> None:
+        try:
+            self._queue.put_nowait(entry)
+        except queue.Full:
+            self.dropped += isinstance(entry, _Entry)
+
+    def _place(self, outcome: Outcome) -> tuple[float, float, float] | None:
+        if not isinstance(outcome, Fix):
+            return None
+        place = self._georeference.geodetic_from_map(outcome.map_from_camera.translation)
+        height_m = place.height_ellipsoid_m if place.height_ellipsoid_m is not None else place.height_amsl_m
+        return place.lat_deg, place.lon_deg, float("nan") if height_m is None else height_m
+
+    def close(self) -> None:
+        """Write what waits and end the thread; a disk that is full or hangs ends neither in an error nor in a wait
+        without end."""
+        with contextlib.suppress(queue.Full):
+            self._queue.put(None, timeout=_CLOSE_WAIT_S)
+        self._thread.join(timeout=_CLOSE_WAIT_S)
+        if self._thread.is_alive():
+            # It holds the file's lock; closing would wait for it.
+            logger.warning("%s: the disk hangs; the last frames are not written", self._folder)
+
+    # -- the thread ------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while (entry := self._queue.get()) is not None:
+            try:
+                self._write(entry)
+                self._failing = False
+            except OSError as err:
+                self._give_up(entry, err)
+            except Exception:  # a defect of logging must end neither the thread nor the flight
+                self.dropped += 1
+                if not self._failing:
+                    logger.exception("flight log")
+                self._failing = True
+        if self._file is not None:
+            try:
+                self._file.finish()
+            except OSError as err:
+                logger.warning("%s: can't write the end of the log (%s); it can be read without", self._folder, err)
+
+    def _give_up(self, entry: _Entry | tuple[int, bytes], err: OSError) -> None:
+        """A file that broke off is left as it is: up to there it can be read."""
+        self.dropped += isinstance(entry, _Entry)
+        if self._file is not None:
+            self._file.abandon()
+            self._file = None
+            self._failed_ns = _stamp_ns(entry)
+        if not self._failing:
+            logger.warning("%s: can't write the log (%s); frames are dropped until it works", self._folder, err)
+        self._failing = True
+
+    def _write(self, entry: _Entry | tuple[int, bytes]) -> None:
+        if self._file is None:
+            if abs(_stamp_ns(entry) - self._failed_ns) < _AGAIN_AFTER_NS:
+                self.dropped += isinstance(entry, _Entry)
+                return
+            self._failed_ns = _stamp_ns(entry)
+            self._file = self._open()
+        if isinstance(entry, _Entry):
+            self._write_frame(self._file, entry)
+        else:
+            stamp_ns, counters = entry
+            self._file.add("health", stamp_ns + self._offset_ns, counters)
+        self._file.flush(_stamp_ns(entry))
+        if self._file.size() >= self._limit_bytes // _FILES_OF_LIMIT:
+            whole, self._file = self._file, None
+            whole.finish()
+            self._file = self._open()
+
+    def _write_frame(self, file: _File, entry: _Entry) -> None:
+        outcome = entry.outcome
+        unix_ns = outcome.stamp_ns + self._offset_ns
+        file.add("outcome", unix_ns, msgspec.json.encode(outcome_record(outcome)))
+        if isinstance(outcome, Fix) and entry.place is not None:
+            file.add("fix", unix_ns, self._location(outcome, entry.place, unix_ns))
+            file.add("pose", unix_ns, self._pose(outcome, unix_ns))
+        image = None if entry.frame is None else self._encoded(entry.frame.image)
+        if image is not None:
+            form, data = image
+            file.add("camera", unix_ns, _image_message(form, data, unix_ns))
+        if entry.record is not None:
+            whole = image is not None and image[0] == "png"
+            file.add("frame", unix_ns, msgspec.json.encode(msgspec.structs.replace(entry.record, whole=whole)))
+
+    def _encoded(self, image: ImageArray) -> tuple[str, bytes] | None:
+        """None where none is wanted, or it is no picture: then it was refused, too."""
+        if self._frames == "none" or image.dtype != np.uint8 or image.ndim not in (2, 3) or not image.size:
+            return None
+        try:
+            if self._frames == "all":
+                # Every matcher begins so; the rest of a colour image tells a replay nothing.
+                grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+                return "png", cv2.imencode(".png", grey, _FAST_PNG)[1].tobytes()
+            scale = min(1.0, _THUMBNAIL_PX / max(image.shape[:2]))
+            small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+            if small.ndim == 3:
+                small = cv2.cvtColor(small, cv2.COLOR_RGB2BGR)
+            return "jpeg", cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _THUMBNAIL_QUALITY])[1].tobytes()
+        except cv2.error:
+            return None
+
+    def _location(self, fix: Fix, place: tuple[float, float, float], unix_ns: int) -> bytes:
+        ned_from_map = frames.map_from_ned_rotation(
+            self._georeference.convergence_rad(fix.map_from_camera.translation[:2])
+        ).T
+        ned = cov.rotated(fix.covariance, ned_from_map)[:3, :3]
+        # Foxglove wants east, north, up.
+        enu = _ENU_FROM_NED @ ned @ _ENU_FROM_NED.T
+        return msgspec.json.encode(
+            {
+                "timestamp": _time(unix_ns),
+                "frame_id": "camera",
+                "latitude": place[0],
+                "longitude": place[1],
+                "altitude": place[2],
+                "position_covariance": enu.ravel().tolist(),
+                "position_covariance_type": 3,
+            }
+        )
+
+    def _pose(self, fix: Fix, unix_ns: int) -> bytes:
+        x, y, z = (fix.map_from_camera.translation - [*self._georeference.anchor, 0.0]).tolist()
+        qw, qx, qy, qz = rotation.to_quaternion(fix.map_from_camera.rotation).tolist()
+        return msgspec.json.encode(
+            {
+                "timestamp": _time(unix_ns),
+                "frame_id": "map",
+                "pose": {
+                    "position": {"x": x, "y": y, "z": z},
+                    "orientation": {"x": qx, "y": qy, "z": qz, "w": qw},
+                },
+            }
+        )
+
+    # -- files -----------------------------------------------------------------------------------------
+
+    def _free_session(self, unix_ns: int) -> str:
+        """By date, and by number where the clock was never set or the daemon restarts at once."""
+        date = datetime.datetime.fromtimestamp(unix_ns // _S, datetime.UTC).strftime("%Y%m%dT%H%M%SZ")
+        for number in range(10_000):
+            session = f"{date}-{number}" if number else date
+            if not any(self._folder.glob(f"flight-{session}-*.mcap")):
+                return session
+        raise OSError(f"10000 logs of {date}")
+
+    def _open(self) -> _File:
+        self._make_room()
+        header = LogHeader(
+            version=__version__,
+            libraries={"numpy": np.__version__, "opencv": cv2.__version__},
+            session=self._session,
+            part=self._part,
+            unix_minus_stamp_ns=self._offset_ns,
+            **self._header,
+        )
+        file = _File(self._folder / f"flight-{self._session}-{self._part:03d}.mcap", header)
+        self._part += 1
+        return file
+
+    def _make_room(self) -> None:
+        """Remove the oldest logs, so that with one more file the limit is kept."""
+        logs = []
+        for path in self._folder.glob("flight-*.mcap"):
+            with contextlib.suppress(OSError):
+                status = path.stat()
+                logs.append((status.st_mtime_ns, path.name, status.st_size, path))
+        allowed = self._limit_bytes - self._limit_bytes // _FILES_OF_LIMIT
+        total = sum(size for _, _, size, _ in logs)
+        for _, _, size, path in sorted(logs, key=lambda log: log[:2]):
+            if total <= allowed:
+                return
+            with contextlib.suppress(OSError):
+                path.unlink()
+                total -= size
+
+
+class _File:
+    """One file, begun."""
+
+    def __init__(self, path: Path, header: LogHeader) -> None:
+        self._stream: BufferedWriter = path.open("xb")
+        self._synced_ns = 0
+        try:
+            self._writer = Writer(self._stream, chunk_size=_CHUNK_BYTES)
+            self._writer.start("", f"ortholoc-edge {__version__}")
+            self._writer.add_metadata(HEADER_NAME, _as_strings(header))
+            self._channels = {}
+            for name, (topic, schema, definition) in _CHANNELS.items():
+                number = self._writer.register_schema(schema, "jsonschema", json.dumps(definition).encode())
+                self._channels[name] = self._writer.register_channel(topic, "json", number)
+            # A full disk is told here, and leaves no file behind for each try.
+            self._stream.flush()
+        except OSError:
+            self.abandon()
+            path.unlink(missing_ok=True)
+            raise
+
+    def add(self, channel: str, unix_ns: int, message: bytes) -> None:
+        self._writer.add_message(self._channels[channel], unix_ns, message, unix_ns)
+
+    def flush(self, stamp_ns: int) -> None:
+        self._stream.flush()
+        if abs(stamp_ns - self._synced_ns) >= _SYNC_EVERY_NS:
+            self._synced_ns = stamp_ns
+            os.fsync(self._stream.fileno())
+
+    def size(self) -> int:
+        return self._stream.tell()
+
+    def finish(self) -> None:
+        try:
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._stream.flush()
+            os.fsync(self._stream.fileno())
+        finally:
+            self.abandon()
+
+    def abandon(self) -> None:
+        """Close it as it is."""
+        with contextlib.suppress(OSError):
+            # What a full disk did not take is still in the buffer.
+            self._stream.close()
+
+
+def header_of(metadata: Mapping[str, str]) -> LogHeader:
+    """Raises: msgspec.ValidationError, msgspec.DecodeError."""
+    return msgspec.convert({key: msgspec.json.decode(value) for key, value in metadata.items()}, LogHeader)
+
+
+def _as_strings(header: LogHeader) -> dict[str, str]:
+    return {key: json.dumps(value) for key, value in msgspec.to_builtins(header).items()}
+
+
+def _stamp_ns(entry: _Entry | tuple[int, bytes]) -> int:
+    return entry.outcome.stamp_ns if isinstance(entry, _Entry) else entry[0]
+
+
+def _time(unix_ns: int) -> dict[str, int]:
+    return {"sec": unix_ns // _S, "nsec": unix_ns % _S}
+
+
+def _image_message(form: str, data: bytes, unix_ns: int) -> bytes:
+    return msgspec.json.encode(
+        {
+            "timestamp": _time(unix_ns),
+            "frame_id": "camera",
+            "data": base64.b64encode(data).decode(),
+            "format": form,
+        }
+    )
+
+
+def _object(**properties: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "object", "properties": properties}
+
+
+_NUMBER, _INTEGER, _TEXT = {"type": "number"}, {"type": "integer"}, {"type": "string"}
+_STAMP = _object(sec=_INTEGER, nsec=_INTEGER)
+# Foxglove knows its own by name; the fields are those of its published JSON schemas that are filled here.
+_CHANNELS: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "camera": (
+        CAMERA_TOPIC,
+        "foxglove.CompressedImage",
+        _object(
+            timestamp=_STAMP, frame_id=_TEXT, data={"type": "string", "contentEncoding": "base64"}, format=_TEXT
+        ),
+    ),
+    "fix": (
+        "/fix",
+        "foxglove.LocationFix",
+        _object(
+            timestamp=_STAMP,
+            frame_id=_TEXT,
+            latitude=_NUMBER,
+            longitude=_NUMBER,
+            altitude=_NUMBER,
+            position_covariance={"type": "array", "items": _NUMBER},
+            position_covariance_type=_INTEGER,
+        ),
+    ),
+    "pose": (
+        "/pose",
+        "foxglove.PoseInFrame",
+        _object(
+            timestamp=_STAMP,
+            frame_id=_TEXT,
+            pose=_object(
+                position=_object(x=_NUMBER, y=_NUMBER, z=_NUMBER),
+                orientation=_object(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER),
+            ),
+        ),
+    ),
+    "frame": (FRAME_TOPIC, "ortholoc.Frame", msgspec.json.schema(FrameRecord)),
+    "outcome": (
+        "/ortholoc/outcome",
+        "ortholoc.Outcome",
+        _object(
+            stamp_ns=_INTEGER,
+            fix={"type": "boolean"},
+            reason=_TEXT,
+            detail=_TEXT,
+            position_map_m={"type": "array", "items": _NUMBER},
+            quaternion_map_from_camera_wxyz={"type": "array", "items": _NUMBER},
+            protection_m={"type": "array", "items": _NUMBER},
+            inliers=_INTEGER,
+            quality=_NUMBER,
+        ),
+    ),
+    "health": ("/ortholoc/health", "ortholoc.Health", _object(stamp_ns=_INTEGER, statistics={"type": "object"})),
+}
