@@ -31,7 +31,6 @@ from typing import Annotated, Any, Literal
 import cv2
 import msgspec
 import numpy as np
-from mcap.writer import Writer
 from msgspec import Meta, Struct
 
 from ortholoc_edge import __version__
@@ -372,6 +371,9 @@ class _File:
     """One file, begun."""
 
     def __init__(self, path: Path, header: LogHeader) -> None:
+        # Only where a log is kept: it reads its own version through importlib.metadata, and that brings email.
+        from mcap.writer import Writer
+
         self._stream: BufferedWriter = path.open("xb")
         self._synced_ns = 0
         try:
