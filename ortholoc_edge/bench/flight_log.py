@@ -35,7 +35,11 @@ logger = logging.getLogger(__name__)
 # A length beyond any record of ours is a damaged one, and must not be believed.
 _MAX_RECORD_BYTES = 256 << 20
 _MOST_NAMED = 10
-_DAMAGE = (McapError, CRCValidationError, zstandard.ZstdError, struct.error, zlib.error, UnicodeDecodeError)
+# A length inside a record that was damaged asks for more memory than there is.
+_DAMAGE = (
+    McapError, CRCValidationError, zstandard.ZstdError, struct.error, zlib.error, UnicodeDecodeError, KeyError,
+    MemoryError, OverflowError,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
