@@ -7,9 +7,18 @@ import math
 import threading
 from collections import Counter
 
+import numpy as np
+
 from ortholoc_edge.adapters.mavlink import AutopilotLink, AutopilotState, GnssPosition
 from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate
-from ortholoc_edge.adapters.mavlink.geodesy import EarthModel, GeodeticOrigin, Place, is_same_origin, ned_from_geodetic
+from ortholoc_edge.adapters.mavlink.geodesy import (
+    EarthModel,
+    GeodeticOrigin,
+    Place,
+    geodetic_from_ned,
+    is_same_origin,
+    ned_from_geodetic,
+)
 from ortholoc_edge.adapters.mavlink.sinks import earth_model
 from ortholoc_edge.clock import Clock
 from ortholoc_edge.config import AttitudeOptions, MountOptions
@@ -25,6 +34,8 @@ from ortholoc_edge.tiles.georeference import Georeference
 
 logger = logging.getLogger(__name__)
 
+# From its origin; beyond, its filter has diverged.
+_FARTHEST_M = 100_000.0
 # The autopilot's attitude for an exposure arrives after it; the frame waits this long for it at most.
 STATE_WAIT_NS = 150_000_000
 
@@ -82,7 +93,22 @@ class Vehicle:
             (0.0, 0.0) if known.gnss is None else (known.gnss.sigma_horizontal_m, known.gnss.sigma_vertical_m),
             self._gimbal_mount(known),
             trouble or "",
+            self._believed_position(known),
         )
+
+    def _believed_position(self, known: AutopilotState) -> FloatArray | None:
+        """Of its filter, in the map; None where it tells none, or none that can be."""
+        vehicle = self._link.vehicle
+        position, origin = known.local_position_ned_m, known.origin
+        if vehicle is None or position is None or origin is None or not np.isfinite(position).all():
+            return None
+        if float(np.abs(position).max()) > _FARTHEST_M:
+            return None
+        place = geodetic_from_ned(origin, position, earth_model(vehicle.autopilot))
+        try:
+            return self._georeference.map_from_geodetic(place[0], place[1], height_amsl_m=place[2])
+        except MapError:
+            return None
 
     def _gimbal_mount(self, known: AutopilotState) -> CameraMount | None:
         if known.ned_from_gimbal is None or known.ned_from_body is None:

@@ -51,6 +51,8 @@ class VehicleState:
         position_map_m: (3,) easting, northing, height from an absolute source that is trusted now (GNSS before
             it was lost); None otherwise.
         position_sigma_m: 1-sigma of that position, horizontal (per axis) and vertical.
+        believed_map_m: (3,) where the autopilot believes to be, whatever that comes from. It holds our own fixes, so it
+            confirms nothing; but where nothing else says where to look, it does. None where it has no idea.
         no_attitude_because: in words, where that is known; empty otherwise.
         mount: of a camera in a gimbal, as it was at the stamp; None of a fixed one, which the tracker knows, and
             where nothing is known of the gimbal.
@@ -65,3 +67,4 @@ class VehicleState:
     position_sigma_m: tuple[float, float] = (0.0, 0.0)
     mount: CameraMount | None = None
     no_attitude_because: str = ""
+    believed_map_m: FloatArray | None = None

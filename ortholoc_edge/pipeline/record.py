@@ -73,6 +73,7 @@ class FrameRecord(Struct, frozen=True, kw_only=True):
     position_sigma_m: list[float | None]
     mount: tuple[list[list[float]], list[float]] | None
     no_attitude_because: str
+    believed_map_m: list[float | None] | None
     prior_map_from_camera: list[list[float]] | None
     prior_covariance: list[list[float]] | None
     rung: int
@@ -91,6 +92,7 @@ class FrameRecord(Struct, frozen=True, kw_only=True):
             tuple(_floats(self.position_sigma_m).tolist()),
             None if self.mount is None else CameraMount(_rigid(self.mount[0]), (self.mount[1][0], self.mount[1][1])),
             self.no_attitude_because,
+            None if self.believed_map_m is None else _floats(self.believed_map_m),
         )
 
     def circumstances(self) -> Circumstances:
@@ -118,6 +120,7 @@ def frame_record(
         position_sigma_m=list(state.position_sigma_m),
         mount=None if mount is None else (_matrix(mount.body_from_camera), list(mount.sigma_rad)),
         no_attitude_because=state.no_attitude_because,
+        believed_map_m=None if state.believed_map_m is None else state.believed_map_m.tolist(),
         prior_map_from_camera=None if prior is None else _matrix(prior.map_from_camera),
         prior_covariance=None if prior is None else prior.covariance.tolist(),
         rung=circumstances.rung,

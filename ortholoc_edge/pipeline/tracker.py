@@ -35,6 +35,8 @@ class TrackerOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         that alone tells a surface model of another datum from a climb.
     ``unaided_speed_m_per_s``: without odometry, the speed at which the vehicle may have left.
     ``unaided_climb_m_per_s``: and at which it may have climbed.
+    ``believed_sigma_m``: of the autopilot's own position, where to look when nothing else is known: after a restart in
+        flight, or a long cut of the line. Horizontal and vertical 1-sigma.
     ``lost_sigma_m``: horizontal 1-sigma beyond which nothing is known worth predicting from.
     ``jump_m``: a fix this far from the prediction raises the reset counter, if it is also beyond three sigmas.
     """
@@ -46,6 +48,7 @@ class TrackerOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     climb_memory_s: Annotated[float, Meta(gt=0)] = 3.0
     unaided_speed_m_per_s: Annotated[float, Meta(gt=0)] = 15.0
     unaided_climb_m_per_s: Annotated[float, Meta(gt=0)] = 4.0
+    believed_sigma_m: tuple[Annotated[float, Meta(gt=0)], Annotated[float, Meta(gt=0)]] = (25.0, 5.0)
     lost_sigma_m: Annotated[float, Meta(gt=0)] = 150.0
     jump_m: Annotated[float, Meta(gt=0)] = 5.0
 
@@ -120,6 +123,11 @@ class Tracker:
                 "no attitude of the gimbal near the exposure; is it on, and does [mount] name the right one?",
             )
         carried = self._carried(state)
+        if carried is None or _sigma(carried[1]) > self._options.lost_sigma_m:
+            believed = self._believed(state)
+            if believed is not None:
+                # The chain of fixes is broken: the next one is a new start, and the autopilot must hear of it as one.
+                carried, self.status = believed, TrackerStatus.SEARCH
         if carried is None:
             return Rejected(state.stamp_ns, Reason.NO_PRIOR, "no fix yet and no position from the autopilot")
         position, position_covariance = carried
@@ -206,6 +214,16 @@ class Tracker:
             options.climb_error_m_per_s * _wandered_s(elapsed_s, options.climb_memory_s),
         )
         return anchor.position_map_m + step, anchor.covariance + _axes(horizontal_m, vertical_m)
+
+    def _believed(self, state: VehicleState) -> tuple[FloatArray, FloatArray] | None:
+        """Where the autopilot believes to be. Not while GNSS contradicts the fixes: it may have followed a spoofer.
+
+        It is no anchor: the next frame asks again.
+        """
+        believed = state.believed_map_m
+        if believed is None or not np.isfinite(believed).all() or not self.witness.trusted:
+            return None
+        return believed, _axes(*self._options.believed_sigma_m)
 
     def announce_jump(self) -> None:
         """The next estimate starts anew for the autopilot: its origin moved, or it restarted."""

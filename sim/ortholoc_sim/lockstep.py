@@ -96,7 +96,7 @@ class Flown:
         frames: in the order of their outcomes.
         exposed: frames taken by the camera; replaced: those that a newer one replaced.
         said: STATUSTEXT of the daemon, with the time since the start.
-        statistics: the daemon's, at the end.
+        statistics: the daemon's, at the end; of the last, if there were several.
         wall_s: how long it took: for people, not the same twice.
     """
 
@@ -221,7 +221,8 @@ class _Worker:
     """The daemon's worker and its slot, without their threads: the latest frame wins, one at a time."""
 
     def __init__(self, flight: _Flight, daemon: Daemon, latency: LatencyTable) -> None:
-        self._flight, self._daemon, self._latency = flight, daemon, latency
+        self._flight, self._latency = flight, latency
+        self._daemon: Daemon | None = daemon
         self._rng = np.random.default_rng([flight.seed, 64])
         # Whether the autopilot's state is there is seen here; the daemon must not wait while time stands still.
         self._at_once = threading.Event()
@@ -233,27 +234,33 @@ class _Worker:
         self._kept_reasons: set[str] = set()
         self._kept_at_s = -math.inf
 
+    def restart(self, daemon: Daemon | None) -> None:
+        """What the one before was at is gone with it. None: there is none."""
+        self._daemon, self._slot, self._work = daemon, None, None
+
     def put(self, frame: Frame, truth: Rigid3) -> None:
+        if self._daemon is None:
+            return
         self.replaced += self._slot is not None
         self._slot = frame, truth
 
     def step(self, now_ns: int) -> None:
         if self._work is None and self._slot is not None:
             self._work, self._slot = _Work(*self._slot, now_ns), None
-        work = self._work
-        if work is None:
+        work, daemon = self._work, self._daemon
+        if work is None or daemon is None:
             return
         if work.localized is None:
-            known = self._daemon.link.state_at(work.frame.stamp_ns)
+            known = daemon.link.state_at(work.frame.stamp_ns)
             waited = now_ns - work.taken_ns >= STATE_WAIT_NS
             if waited or (known is not None and known.interpolated):
-                self._localize(work, now_ns)
+                self._localize(daemon, work, now_ns)
         elif now_ns >= work.ready_ns:
-            outcome = self._daemon.settle(work.localized)
+            outcome = daemon.settle(work.localized)
             self.done.append(self._flown(work, outcome, now_ns))
             self._work = None
 
-    def _localize(self, work: _Work, now_ns: int) -> None:
+    def _localize(self, daemon: Daemon, work: _Work, now_ns: int) -> None:
         stamp_ns = work.frame.stamp_ns
         # The same numbers are drawn whatever becomes of the frame.
         log_sigma = math.log(self._latency.p99_ms / self._latency.median_ms) / _P99
@@ -267,7 +274,7 @@ class _Worker:
             searched_ms += factor * self._latency.hypothesis_ms
             return (now_ns - stamp_ns) / _MS + searched_ms < self._flight.scenario.timing.max_age_ms
 
-        work.localized = self._daemon.localize(work.frame, self._at_once, proceed)
+        work.localized = daemon.localize(work.frame, self._at_once, proceed)
         outcome = work.localized.outcome
         spent_ms = took_ms * factor + searched_ms if "match" in outcome.timings_ms else _REFUSED_MS
         work.ready_ns = now_ns + round(spent_ms * _MS)
@@ -332,16 +339,25 @@ class _Flight:
 
     def _run(self, progress: Callable[[float], None]) -> Flown:
         began = time.monotonic()
-        daemon = Daemon(self._config(), frames=_NoFrames(), clock=self._clock)
+        first = self._new_daemon()
+        daemon: Daemon | None = first
         try:
-            daemon.navigator.localizer.warm_up()
             camera = _Camera(self, Studio(self._grounds, self.scenario.camera))
-            worker = _Worker(self, daemon, self.scenario.latency)
+            worker = _Worker(self, first, self.scenario.latency)
             end_ns = START_NS + round(self.duration_s * _S)
             happened: set[int] = set()
             while self._loop.now_ns < end_ns and not self._arrived():
                 now_ns = self._loop.now_ns + STEP_NS
                 self._apply_faults(now_ns, happened)
+                killed = self.fault("daemon_killed", now_ns) is not None
+                if killed and daemon is not None:
+                    # What it holds is released, but nobody is told: it had no time for that.
+                    daemon.close()
+                    daemon = None
+                    worker.restart(daemon)
+                elif not killed and daemon is None:
+                    daemon = self._new_daemon()
+                    worker.restart(daemon)
                 # What arrives meanwhile first: the line keeps the order in which it is handed frames.
                 self._carry(daemon, now_ns)
                 for message in self._loop.advance(now_ns):
@@ -351,17 +367,24 @@ class _Flight:
                     for frame, truth in camera.arrived(now_ns):
                         worker.put(frame, truth)
                     worker.step(now_ns)
-                daemon.report()
-                daemon.link.exchange(self._transport)
+                if daemon is not None:
+                    daemon.report()
+                    daemon.link.exchange(self._transport)
                 progress((now_ns - START_NS) / _S)
-            statistics = daemon.statistics()
+            statistics = {} if daemon is None else daemon.statistics()
         finally:
-            daemon.close()
+            if daemon is not None:
+                daemon.close()
         return Flown(
             self.scenario, self.seed, self._loop, self._site, self._route, self._pack, tuple(worker.done),
             camera.exposed, worker.replaced, tuple(self._said), dict(self._line.counts), statistics,
             time.monotonic() - began,
         )  # fmt: skip
+
+    def _new_daemon(self) -> Daemon:
+        daemon = Daemon(self._config(), frames=_NoFrames(), clock=self._clock)
+        daemon.navigator.localizer.warm_up()
+        return daemon
 
     def _arrived(self) -> bool:
         if not self._until_arrival or not self._loop.on_last_leg:
@@ -371,14 +394,15 @@ class _Flight:
         believed = site.map_from_ned(site.ned_from_autopilot(self._loop.samples[-1].estimate_m))
         return float(np.hypot(*(believed - self._route[-1])[:2])) < _ARRIVED_M
 
-    def _carry(self, daemon: Daemon, until_ns: int) -> None:
+    def _carry(self, daemon: Daemon | None, until_ns: int) -> None:
         """Let what is on the line arrive, each frame at its time."""
         while (next_ns := self._line.next_ns()) is not None and next_ns <= until_ns:
             self._clock.set_ns(max(next_ns, self._clock.now_ns()))
             end, data = self._line.take()
             if end is End.COMPANION:
-                self._transport.arrive(data)
-                daemon.link.exchange(self._transport)
+                if daemon is not None:
+                    self._transport.arrive(data)
+                    daemon.link.exchange(self._transport)
                 continue
             messages = self._ours.feed(data, next_ns)
             for message in messages:

@@ -213,6 +213,7 @@ class TimingTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 FaultKind = Literal[
     "camera_stalls", "frames_black", "frames_duplicated", "frames_out_of_order", "frames_late", "frames_frozen",
     "frames_of_water", "line_down", "autopilot_mute", "autopilot_reboots", "clock_steps", "computer_slow",
+    "daemon_killed",
 ]  # fmt: skip
 
 
@@ -221,6 +222,7 @@ class Fault(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     Attributes:
         from_s, until_s: since the start of the flight; without an end it lasts.
+            "daemon_killed" ends with a new daemon, which knows nothing of the first.
         amount: of "frames_late" the delay in ms, of "clock_steps" the step in ms, of "computer_slow" the factor.
     """
 

@@ -14,9 +14,9 @@ from adapters.link_scenes import MS, Flight, S
 from pipeline.scenes_pipeline import fix
 from replay import rendered
 
-from ortholoc_edge.adapters.mavlink.estimates import VisionEstimate
-from ortholoc_edge.adapters.mavlink.geodesy import EarthModel
-from ortholoc_edge.adapters.mavlink.state import AutopilotState
+from ortholoc_edge.adapters.mavlink.estimates import Autopilot, VisionEstimate
+from ortholoc_edge.adapters.mavlink.geodesy import EarthModel, GeodeticOrigin
+from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity, AutopilotState
 from ortholoc_edge.config import AttitudeOptions, MountOptions
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.tiles.georeference import Georeference
@@ -60,6 +60,8 @@ class _Link:
     def trouble(self) -> str | None:
         return None
 
+    vehicle: AutopilotIdentity | None = None
+
 
 @pytest.mark.parametrize(("late_ms", "waited_ms"), [(0, 5), (100, 100), (9000, 150)])
 def test_a_frame_waits_a_little_for_the_attitude_that_follows_it(late_ms: int, waited_ms: int) -> None:
@@ -71,3 +73,39 @@ def test_a_frame_waits_a_little_for_the_attitude_that_follows_it(late_ms: int, w
     state = vehicle.at(S, threading.Event())
     assert state.ned_from_body is not None
     assert (link.now - S) // MS == pytest.approx(waited_ms, abs=5)
+
+
+@pytest.mark.parametrize(
+    ("changed", "known"),
+    [
+        ({}, True),
+        ({"origin": None}, False),
+        ({"local_position_ned_m": None}, False),
+        ({"local_position_ned_m": np.array([np.nan, 0.0, 0.0])}, False),
+        ({"local_position_ned_m": np.array([9e6, 0.0, 0.0])}, False),
+    ],
+)
+def test_where_the_autopilot_believes_to_be_is_told_in_the_map(changed: dict[str, Any], known: bool) -> None:
+    georeference = rendered.georeference()
+    there = rendered.pose().translation + np.array([3.0, -4.0, 5.0])
+    place = georeference.geodetic_from_map(rendered.pose().translation)
+    assert place.height_amsl_m is not None
+    origin = GeodeticOrigin(place.lat_deg, place.lon_deg, place.height_amsl_m)
+    convergence = georeference.convergence_rad(there[:2])
+    north, east = (
+        -4.0 * np.cos(convergence) + 3.0 * np.sin(convergence), 3.0 * np.cos(convergence) + 4.0 * np.sin(convergence),
+    )  # fmt: skip
+    link: Any = _Link(0)
+    fields = {"origin": origin, "local_position_ned_m": np.array([north, east, -5.0])} | changed
+    first = link.state_at
+    link.state_at = lambda stamp_ns: replace(first(stamp_ns), **fields)
+    link.vehicle = AutopilotIdentity(1, Autopilot.PX4, None)
+    vehicle = Vehicle(
+        link, cast(Any, None), georeference, MountOptions(), AttitudeOptions(), link, Counter()
+    )
+    believed = vehicle.at(S, threading.Event()).believed_map_m
+    if known:
+        assert believed is not None
+        assert np.allclose(believed, there, atol=0.02), believed - there
+    else:
+        assert believed is None

@@ -211,6 +211,43 @@ def test_lost_means_search_and_the_next_fix_is_a_reset():
     assert made.reset_counter == 2
 
 
+def test_where_nothing_is_known_the_autopilots_own_position_says_where_to_look():
+    made = tracker(believed_sigma_m=(20.0, 4.0))
+    prior = made.predict(replace(state(1), believed_map_m=np.array([7.0, 8.0, 90.0])))
+    assert np.allclose(prior.map_from_camera.translation, (7, 8, 90))
+    assert np.allclose(sigma_of(prior), (20, 20, 4))
+    # It is no anchor: without one there is nothing to carry on.
+    assert isinstance(made.predict(state(2)), Rejected)
+    now = replace(state(3), believed_map_m=np.array([9.0, 8.0, 90.0]))
+    made.predict(now)
+    made.update(fix((30.0, 8.0, 90.0)), now)
+    assert made.status is TrackerStatus.TRACK
+    assert made.reset_counter == 1, "a new start, of which the autopilot hears"
+
+
+def test_a_broken_chain_begins_anew_where_the_autopilot_believes_to_be():
+    made = fixed(lost_sigma_m=100.0, unaided_speed_m_per_s=10.0)
+    believed = np.array([50.0, 60.0, 100.0])
+    close = made.predict(replace(state(9), believed_map_m=believed))
+    assert np.allclose(close.map_from_camera.translation, (0, 0, 100)), "the chain of fixes is worth more"
+    lost = made.predict(replace(state(20), believed_map_m=believed))
+    assert np.allclose(lost.map_from_camera.translation, believed)
+    assert made.status is TrackerStatus.SEARCH
+    for worthless in (np.array([np.nan, 0, 0]), None):
+        assert isinstance(made.predict(replace(state(20), believed_map_m=worthless)), Rejected)
+
+
+def test_an_autopilot_that_may_have_followed_a_spoofer_says_not_where_to_look():
+    made = fixed(lost_sigma_m=100.0, unaided_speed_m_per_s=10.0)
+    for second in range(1, 12):
+        led_away = state(second, (0, 0, 0), position=(60.0, 0.0, 100.0))
+        made.predict(led_away)
+        made.update(fix((0.0, 0.0, 100.0)), led_away)
+    assert made.witness.report.state is Consistency.BAD
+    believed = replace(state(23), believed_map_m=np.array([60.0, 0.0, 100.0]))
+    assert isinstance(made.predict(believed), Rejected)
+
+
 def test_status_follows_the_outcomes():
     made = fixed()
     assert made.status is TrackerStatus.TRACK
