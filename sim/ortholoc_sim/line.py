@@ -1,9 +1,8 @@
-"""A simulated line between companion and autopilot: frames go in and come out later, or not at all."""
+"""A simulated line between companion and autopilot: frames go in and come out later, damaged, or not at all."""
 
 from __future__ import annotations
 
-import heapq
-from collections import Counter
+from collections import Counter, deque
 from enum import IntEnum
 from typing import Annotated, Any
 
@@ -12,8 +11,10 @@ from msgspec import Meta, Struct
 
 from ortholoc_edge.clock import Clock
 
+_S = 1_000_000_000
+_BITS_PER_BYTE = 10  # with start and stop bit
 # As the real transport has it: what may wait to be written.
-_OUT_LIMIT_BYTES = 2048
+_ROOM_BYTES = 2048
 
 
 class LineOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -22,13 +23,86 @@ class LineOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     Attributes:
         delay_ms: of every frame; 25 are a round trip of 50 ms. jitter_ms: up to so much more, by lot.
         loss: share of frames that never arrive.
+        corruption: share of bytes of which one bit turns.
         baud: of a serial line, ten bits to a byte; 0: as fast as a socket.
     """
 
     delay_ms: Annotated[float, Meta(ge=0, le=2000)] = 0.5
     jitter_ms: Annotated[float, Meta(ge=0, le=2000)] = 1.0
     loss: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    corruption: Annotated[float, Meta(ge=0, le=1)] = 0.0
     baud: Annotated[int, Meta(ge=0)] = 0
+
+
+PERFECT = LineOptions(delay_ms=0.0, jitter_ms=0.0)
+
+
+class Wire:
+    """One direction: frames on their way. Order is kept.
+
+    Attributes:
+        down: whether frames are lost now.
+        counts: ``lost``, ``refused`` (no room) and ``carried``.
+    """
+
+    def __init__(self, options: LineOptions, rng: np.random.Generator) -> None:
+        self._options, self._rng = options, rng
+        self.down = False
+        self.counts: Counter[str] = Counter()
+        self._way: deque[tuple[int, bytes]] = deque()
+        self._last_ns = 0
+        # Until when it is busy with what was handed to it.
+        self._free_ns = 0
+
+    def waiting_bytes(self, now_ns: int) -> int:
+        """What has not left the sender's buffer."""
+        if not self._options.baud:
+            return 0
+        return max(0, (self._free_ns - now_ns) * self._options.baud // (_BITS_PER_BYTE * _S))
+
+    def send(self, frame: bytes, now_ns: int) -> bool:
+        """Hand a frame over, which travels as a whole; False if the buffer has no room for it."""
+        options = self._options
+        if self.waiting_bytes(now_ns) + len(frame) > _ROOM_BYTES:
+            self.counts["refused"] += 1
+            return False
+        leaves_ns = now_ns
+        if options.baud:
+            leaves_ns = max(now_ns, self._free_ns) + len(frame) * _BITS_PER_BYTE * _S // options.baud
+            self._free_ns = leaves_ns
+        # Both are drawn for every frame, so that one fault leaves the fate of all others as it was.
+        jitter, fate = self._rng.random(2)
+        if self.down or fate < options.loss:
+            self.counts["lost"] += 1
+            return True
+        if options.corruption:
+            frame = self._damaged(frame)
+        late_ns = round((options.delay_ms + jitter * options.jitter_ms) * 1e6)
+        self._last_ns = max(leaves_ns + late_ns, self._last_ns)
+        self._way.append((self._last_ns, frame))
+        self.counts["carried"] += 1
+        return True
+
+    def next_ns(self) -> int | None:
+        """When the next frame arrives; None if none is under way."""
+        return self._way[0][0] if self._way else None
+
+    def take(self) -> bytes:
+        """The frame of `next_ns`."""
+        return self._way.popleft()[1]
+
+    def arrived(self, now_ns: int) -> list[bytes]:
+        """All frames that are there by now."""
+        frames = []
+        while self._way and self._way[0][0] <= now_ns:
+            frames.append(self.take())
+        return frames
+
+    def _damaged(self, frame: bytes) -> bytes:
+        array = np.frombuffer(frame, np.uint8)
+        hit = self._rng.random(len(array)) < self._options.corruption
+        bits = np.uint8(1) << self._rng.integers(0, 8, len(array), dtype=np.uint8)
+        return (array ^ np.where(hit, bits, np.uint8(0))).tobytes()
 
 
 class End(IntEnum):
@@ -39,60 +113,25 @@ class End(IntEnum):
 
 
 class Line:
-    """Frames on their way, by time of arrival. Order is kept, as on a wire.
-
-    Attributes:
-        down: per end, whether frames for it are lost now.
-        counts: ``lost``, ``refused`` (no room) and ``carried``.
-    """
+    """Both directions, by time of arrival. ``wires``: towards each end."""
 
     def __init__(self, options: LineOptions, seed: int) -> None:
-        self.options = options
-        self.down = {end: False for end in End}
-        self.counts: Counter[str] = Counter()
-        self._rng = np.random.default_rng([seed, 61])
-        self._way: list[tuple[int, int, End, bytes]] = []
-        self._last_ns = {end: 0 for end in End}
-        # Until when the wire is busy with what was handed to it.
-        self._free_ns = {end: 0 for end in End}
-        self._sent = 0
+        self.wires = {end: Wire(options, np.random.default_rng([seed, 61, end])) for end in End}
 
-    def waiting_bytes(self, end: End, now_ns: int) -> int:
-        """What has not left the sender's buffer."""
-        if not self.options.baud:
-            return 0
-        return max(0, (self._free_ns[end] - now_ns) * self.options.baud // 10_000_000_000)
-
-    def send(self, end: End, frame: bytes, now_ns: int) -> bool:
-        """Hand a frame to the line; False if its buffer has no room for it."""
-        if self.waiting_bytes(end, now_ns) + len(frame) > _OUT_LIMIT_BYTES:
-            self.counts["refused"] += 1
-            return False
-        leaves_ns = now_ns
-        if self.options.baud:
-            leaves_ns = max(now_ns, self._free_ns[end]) + len(frame) * 10_000_000_000 // self.options.baud
-            self._free_ns[end] = leaves_ns
-        # Both are drawn for every frame, so that one fault leaves the fate of all others as it was.
-        jitter, fate = self._rng.random(2)
-        if self.down[end] or fate < self.options.loss:
-            self.counts["lost"] += 1
-            return True
-        late_ns = round((self.options.delay_ms + jitter * self.options.jitter_ms) * 1e6)
-        arrives_ns = max(leaves_ns + late_ns, self._last_ns[end])
-        self._last_ns[end] = arrives_ns
-        self._sent += 1
-        heapq.heappush(self._way, (arrives_ns, self._sent, end, frame))
-        self.counts["carried"] += 1
-        return True
+    @property
+    def counts(self) -> Counter[str]:
+        """Of both."""
+        return sum((wire.counts for wire in self.wires.values()), Counter())
 
     def next_ns(self) -> int | None:
-        """When the next frame arrives; None if none is under way."""
-        return self._way[0][0] if self._way else None
+        """When the next frame arrives at either end; None if none is under way."""
+        due = [at for wire in self.wires.values() if (at := wire.next_ns()) is not None]
+        return min(due, default=None)
 
     def take(self) -> tuple[End, bytes]:
         """The frame of `next_ns`."""
-        _, _, end, frame = heapq.heappop(self._way)
-        return end, frame
+        _, end = min((at, end) for end, wire in self.wires.items() if (at := wire.next_ns()) is not None)
+        return end, self.wires[end].take()
 
 
 class LineTransport:
@@ -101,7 +140,7 @@ class LineTransport:
     cut_datagrams = 0
 
     def __init__(self, line: Line, clock: Clock) -> None:
-        self._line, self._clock = line, clock
+        self._wire, self._clock = line.wires[End.AUTOPILOT], clock
         self._arrived: list[bytes] = []
 
     def arrive(self, frame: bytes) -> None:
@@ -116,10 +155,10 @@ class LineTransport:
         return [(frame, None) for frame in arrived]
 
     def send(self, frame: bytes) -> bool:
-        return self._line.send(End.AUTOPILOT, frame, self._clock.now_ns())
+        return self._wire.send(frame, self._clock.now_ns())
 
     def pending(self) -> bool:
-        return self._line.waiting_bytes(End.AUTOPILOT, self._clock.now_ns()) > 0
+        return self._wire.waiting_bytes(self._clock.now_ns()) > 0
 
     def flush(self) -> None:
         pass

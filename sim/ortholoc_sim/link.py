@@ -17,11 +17,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
 
+import msgspec
 import numpy as np
 
 from ortholoc_edge.cli.arguments import non_negative, positive, seed, within
@@ -32,7 +33,6 @@ from ortholoc_sim.autopilot import (
     Airframe,
     AutopilotOptions,
     FilterOptions,
-    LineOptions,
     Message,
     Port,
     PtyPort,
@@ -43,6 +43,7 @@ from ortholoc_sim.autopilot import (
 )
 from ortholoc_sim.fixed_wing import FixedWingOptions
 from ortholoc_sim.gnss import GnssEvent
+from ortholoc_sim.line import PERFECT, LineOptions
 from ortholoc_sim.loop import STEP_NS, ClosedLoop, LoopOptions
 from ortholoc_sim.route import circle, read_waypoints, site_at
 from ortholoc_sim.site import Geopoint
@@ -487,7 +488,9 @@ def spec_of(args: argparse.Namespace) -> LinkSpec:
     """Raises: ConfigError that names what can't be used."""
     over: Literal["udp", "tcp", "pty"] = "pty" if args.pty else "tcp" if args.tcp else "udp"
     home = _HOME if args.home is None else Geopoint(*_numbers(args.home, "--home", 3, 3))
-    line = LineOptions(args.baud, args.delay_ms, args.jitter_ms, args.loss, args.corruption)
+    line = LineOptions(
+        baud=args.baud, delay_ms=args.delay_ms, jitter_ms=args.jitter_ms, loss=args.loss, corruption=args.corruption
+    )
     north, east = _numbers(args.wind, "--wind", 2, 2)
     try:
         gnss = _events(args)
@@ -498,7 +501,7 @@ def spec_of(args: argparse.Namespace) -> LinkSpec:
         over=over,
         address=("127.0.0.1", 0) if args.udpout else _address(args.tcp or args.udp or "14550"),
         peer=_address(args.udpout) if args.udpout else None,
-        line=None if line == LineOptions() else line,
+        line=None if line == PERFECT else line,
         home=home,
         route=args.route,
         airframe=args.airframe,
@@ -532,7 +535,7 @@ def main(argv: list[str] | None = None) -> int:
         signal.signal(number, lambda *_: ended.set())
     try:
         link = SimulatedLink(spec_of(args), tell)
-        line = asdict(link.spec.line) if link.spec.line else {}
+        line = msgspec.to_builtins(link.spec.line) if link.spec.line else {}
         tell({"kind": "open", "t_s": 0.0, "endpoint": link.endpoint, "firmware": args.firmware, "line": line})
         with link:
             restarts_s = args.reboot_at

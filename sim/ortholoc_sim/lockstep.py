@@ -414,7 +414,7 @@ class _Flight:
     def _send_as_autopilot(self, message: Message, now_ns: int) -> None:
         data = bytes(message.pack(self._theirs))
         self._theirs.seq = (self._theirs.seq + 1) % 256
-        self._line.send(End.COMPANION, data, now_ns)
+        self._line.wires[End.COMPANION].send(data, now_ns)
 
     def _hear(self, message: Message, now_ns: int) -> None:
         """Keep what the ground station would show; long texts come in parts."""
@@ -428,8 +428,8 @@ class _Flight:
 
     def _apply_faults(self, now_ns: int, happened: set[int]) -> None:
         down = self.fault("line_down", now_ns) is not None
-        self._line.down[End.AUTOPILOT] = down
-        self._line.down[End.COMPANION] = down or self.fault("autopilot_mute", now_ns) is not None
+        self._line.wires[End.AUTOPILOT].down = down
+        self._line.wires[End.COMPANION].down = down or self.fault("autopilot_mute", now_ns) is not None
         # Two of a kind may follow each other, and may be alike.
         for number, once in enumerate(self.scenario.fault):
             if once.kind not in _ONCE or number in happened or not once.holds((now_ns - START_NS) / _S):

@@ -19,9 +19,9 @@ import numpy as np
 import pytest
 from autopilot_rig import Rig
 from ortholoc_sim import link as tool
-from ortholoc_sim.autopilot import FilterOptions, LineOptions, Verdict, dialect
-from ortholoc_sim.autopilot.ports import Line
+from ortholoc_sim.autopilot import FilterOptions, Verdict, dialect
 from ortholoc_sim.gnss import GnssEvent
+from ortholoc_sim.line import LineOptions, Wire
 from ortholoc_sim.link import LinkSpec, SimulatedLink
 from ortholoc_sim.route import circle, read_waypoints, site_at
 from ortholoc_sim.site import Geopoint, Site
@@ -253,26 +253,26 @@ def test_the_documents_commands_are_understood() -> None:
 
 
 def test_a_line_is_as_slow_as_its_baud_rate_and_keeps_order() -> None:
-    line = Line(LineOptions(baud=57_600, delay_ms=5.0, jitter_ms=20.0), seed=3)
+    wire = Wire(LineOptions(baud=57_600, delay_ms=5.0, jitter_ms=20.0), np.random.default_rng(3))
     for n in range(10):
-        line.put(bytes([n]) * 28, 0)
+        wire.send(bytes([n]) * 28, 0)
     arrivals = []
-    while (due := line.next_ns()) is not None:
-        arrivals += [(due, chunk[0]) for chunk in line.take(due)]
+    while (due := wire.next_ns()) is not None:
+        arrivals += [(due, chunk[0]) for chunk in wire.arrived(due)]
     assert [n for _, n in arrivals] == list(range(10))
     assert arrivals[0][0] > 28 * 10 / 57_600 * S
     assert arrivals[-1][0] > 10 * 28 * 10 / 57_600 * S  # one after the other
     for _ in range(400):
-        line.put(b"x" * 28, S)
-    assert line.dropped > 100  # what a real one would have no buffer for
+        wire.send(b"x" * 28, S)
+    assert wire.counts["refused"] > 300  # what a real one would have no buffer for
 
 
 def test_a_bad_line_loses_and_damages_the_same_each_time() -> None:
     def sent(seed: int) -> list[bytes]:
-        line = Line(LineOptions(loss=0.2, corruption=0.01), seed)
+        wire = Wire(LineOptions(loss=0.2, corruption=0.01), np.random.default_rng(seed))
         for n in range(500):
-            line.put(bytes([n % 256]) * 20, n)
-        return line.take(S)
+            wire.send(bytes([n % 256]) * 20, n)
+        return wire.arrived(S)
 
     first = sent(1)
     assert sent(1) == first and sent(2) != first

@@ -373,28 +373,29 @@ def test_gnss_events() -> None:
 
 def test_a_line_delays_loses_and_is_as_fast_as_its_baud_rate() -> None:
     line = Line(LineOptions(delay_ms=25.0, jitter_ms=0.0), 1)
-    assert line.send(End.AUTOPILOT, b"x" * 100, 5 * S)
+    assert line.wires[End.AUTOPILOT].send(b"x" * 100, 5 * S)
     assert line.next_ns() == 5 * S + 25 * MS
     assert line.take() == (End.AUTOPILOT, b"x" * 100)
     assert line.next_ns() is None
     slow = Line(LineOptions(delay_ms=0.0, jitter_ms=0.0, baud=57_600), 1)
-    assert slow.send(End.COMPANION, b"x" * 576, 0) and slow.next_ns() == 100 * MS
-    assert slow.waiting_bytes(End.COMPANION, 50 * MS) == 288
+    wire = slow.wires[End.COMPANION]
+    assert wire.send(b"x" * 576, 0) and slow.next_ns() == 100 * MS
+    assert wire.waiting_bytes(50 * MS) == 288
     # What waits to be written is bounded, and the other direction has a wire of its own.
-    sent = [slow.send(End.COMPANION, b"x" * 576, 0) for _ in range(6)]
+    sent = [wire.send(b"x" * 576, 0) for _ in range(6)]
     assert sent == [True, True, False, False, False, False] and slow.counts["refused"] == 4
-    assert slow.send(End.AUTOPILOT, b"x", 0)
+    assert slow.wires[End.AUTOPILOT].send(b"x", 0)
     lossy = Line(LineOptions(loss=0.25, jitter_ms=20.0), 3)
     for k in range(4000):
-        lossy.send(End.AUTOPILOT, bytes([k % 256]), k * MS)
+        lossy.wires[End.AUTOPILOT].send(bytes([k % 256]), k * MS)
     assert lossy.counts["lost"] == pytest.approx(1000, abs=100)
     arrivals = []
     while (now_ns := lossy.next_ns()) is not None:
         arrivals.append(now_ns)
         lossy.take()
     assert arrivals == sorted(arrivals)
-    lossy.down[End.AUTOPILOT] = True
-    lossy.send(End.AUTOPILOT, b"x", 9 * S)
+    lossy.wires[End.AUTOPILOT].down = True
+    lossy.wires[End.AUTOPILOT].send(b"x", 9 * S)
     assert lossy.next_ns() is None
 
 

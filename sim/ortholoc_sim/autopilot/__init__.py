@@ -13,7 +13,7 @@ from ortholoc_sim.autopilot.core import AutopilotCore
 from ortholoc_sim.autopilot.dialect import Message, dialect
 from ortholoc_sim.autopilot.gimbal import GimbalOptions
 from ortholoc_sim.autopilot.options import Airframe, AutopilotOptions, FilterOptions
-from ortholoc_sim.autopilot.ports import LineOptions, Port, PtyPort, TcpPort, UdpPort
+from ortholoc_sim.autopilot.ports import Port, PtyPort, TcpPort, UdpPort
 from ortholoc_sim.autopilot.position_filter import PositionFilter
 from ortholoc_sim.autopilot.records import Verdict, VisionRecord
 from ortholoc_sim.autopilot.sensors import SensorOptions
@@ -24,7 +24,6 @@ __all__ = [
     "AutopilotOptions",
     "FilterOptions",
     "GimbalOptions",
-    "LineOptions",
     "Message",
     "Port",
     "PositionFilter",

@@ -8,83 +8,17 @@ from __future__ import annotations
 
 import contextlib
 import os
-import random
 import socket
 import tty
-from collections import deque
-from dataclasses import dataclass
 from typing import Protocol
+
+import numpy as np
 
 from ortholoc_edge.clock import Clock, SystemClock
 from ortholoc_sim.autopilot.dialect import Message, dialect
+from ortholoc_sim.line import LineOptions, Wire
 
-_S = 1_000_000_000
 _READ_BYTES = 65536
-# What may wait for a slow line; beyond it frames are dropped, as an autopilot does.
-_BACKLOG_BYTES = 4096
-
-
-@dataclass(frozen=True, slots=True)
-class LineOptions:
-    """What lies between, the same both ways.
-
-    Attributes:
-        baud: bits per second of a serial line, ten to a byte; 0 is infinitely fast.
-        delay_ms, jitter_ms: every chunk is late by the first and a random part of the second; order is kept.
-        loss: probability that a frame that is sent, or a chunk that is received, does not arrive.
-        corruption: probability per byte that one of its bits turns.
-    """
-
-    baud: int = 0
-    delay_ms: float = 0.0
-    jitter_ms: float = 0.0
-    loss: float = 0.0
-    corruption: float = 0.0
-
-
-class Line:
-    """One direction of it: bytes go in at a time, and come out at another."""
-
-    def __init__(self, options: LineOptions, seed: int) -> None:
-        self._options = options
-        self._random = random.Random(seed)
-        self._under_way: deque[tuple[int, bytes]] = deque()
-        self._busy_until_ns = self._last_due_ns = 0
-        self.dropped = self.lost = 0
-
-    def put(self, data: bytes, now_ns: int) -> None:
-        """Hand over a chunk, which travels as a whole."""
-        o = self._options
-        start_ns = max(now_ns, self._busy_until_ns)
-        if o.baud > 0:
-            if (start_ns - now_ns) * o.baud // (10 * _S) > _BACKLOG_BYTES:
-                self.dropped += 1
-                return
-            self._busy_until_ns = start_ns + len(data) * 10 * _S // o.baud
-        if self._random.random() < o.loss:
-            self.lost += 1
-            return
-        if o.corruption > 0.0:
-            damaged = bytearray(data)
-            for i in range(len(damaged)):
-                if self._random.random() < o.corruption:
-                    damaged[i] ^= 1 << self._random.randrange(8)
-            data = bytes(damaged)
-        late_ms = o.delay_ms + o.jitter_ms * self._random.random()
-        due_ns = max(self._last_due_ns, max(start_ns, self._busy_until_ns) + round(late_ms * 1e6))
-        self._last_due_ns = due_ns
-        self._under_way.append((due_ns, data))
-
-    def take(self, now_ns: int) -> list[bytes]:
-        """The chunks that have arrived."""
-        out = []
-        while self._under_way and self._under_way[0][0] <= now_ns:
-            out.append(self._under_way.popleft()[1])
-        return out
-
-    def next_ns(self) -> int | None:
-        """When the next one arrives."""
-        return self._under_way[0][0] if self._under_way else None
 
 
 class Port(Protocol):
@@ -136,8 +70,8 @@ class _MavlinkPort:
         self._mav = dialect.MAVLink(None, system_id, dialect.MAV_COMP_ID_AUTOPILOT1)
         self._mav.robust_parsing = True
         self._clock = clock or SystemClock()
-        self._in = Line(line, 2 * seed) if line is not None else None
-        self._out = Line(line, 2 * seed + 1) if line is not None else None
+        self._in = None if line is None else Wire(line, np.random.default_rng([seed, 63, 0]))
+        self._out = None if line is None else Wire(line, np.random.default_rng([seed, 63, 1]))
         self.bad_data = 0
 
     @property
@@ -152,9 +86,9 @@ class _MavlinkPort:
         if self._in is not None and self._out is not None:
             now_ns = self._clock.now_ns()
             for chunk in chunks:
-                self._in.put(chunk, now_ns)
-            chunks = self._in.take(now_ns)
-            for chunk in self._out.take(now_ns):
+                self._in.send(chunk, now_ns)
+            chunks = self._in.arrived(now_ns)
+            for chunk in self._out.arrived(now_ns):
                 self._device.write(chunk)
         messages: list[Message] = []
         for chunk in chunks:
@@ -172,7 +106,7 @@ class _MavlinkPort:
             if self._out is None:
                 self._device.write(data)
             else:
-                self._out.put(data, self._clock.now_ns())
+                self._out.send(data, self._clock.now_ns())
 
     def next_ns(self) -> int | None:
         due = [line.next_ns() for line in (self._in, self._out) if line is not None]
