@@ -20,7 +20,7 @@ from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.grid import resize_px
 from ortholoc_edge.matching.adhop import fit_homography
 from ortholoc_edge.matching.types import AnyMatcher, Features, Matcher, Matches, Structural, UnscaledMatcher
-from ortholoc_edge.pipeline import gate, precondition, structural
+from ortholoc_edge.pipeline import gate, precondition, structural, surface
 from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.precondition import ReferenceView
@@ -289,7 +289,14 @@ class Localizer:
             )
             limits = gate.for_structure(found.support, self._options.gate)
             fix = self._fix(frame, solved, scene, prior, limits)
-        return replace(fix, quality=found.support)
+            # After the gate: what is less certain must not pass the more easily.
+            unsettled_m = surface.unsettled_m(
+                scene.window.dsm, scene.window.dsm_grid, fix.points_map, found.support
+            )
+            covariance = fix.covariance + surface.unsettled_covariance(
+                unsettled_m, fix.points_map, fix.map_from_camera.translation
+            )
+        return replace(fix, quality=found.support, covariance=covariance)
 
     def _refined(
         self,
