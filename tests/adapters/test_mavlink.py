@@ -1064,6 +1064,10 @@ def test_flight_over_a_real_wire(pair):
         texts = wait_for(lambda: (t := [m for m in autopilot.got if m.get_type() == "STATUSTEXT"])[1:] and t)
         assert "".join(t.text for t in texts) == "vision: " + "abcdefghij" * 9
         assert texts[0].id == texts[1].id != 0 and [text.chunk_seq for text in texts] == [0, 1]
+        # A full part can't show that it is the last.
+        link.send_status_text(Severity.INFO, "x" * 100)
+        full = wait_for(lambda: (t := [m for m in autopilot.got if getattr(m, "severity", 0) == 6])[2:] and t)
+        assert [m.text for m in full] == ["x" * 50, "x" * 50, ""] and len({m.id for m in full}) == 1
         wait_for(lambda: [m for m in autopilot.got if m.get_type() == "HEARTBEAT" and m.system_status == 4])
         # PX4 takes only round trips below 10 ms for its own synchronisation. The fastest shows what the link
         # can do; the rest, what else this machine is busy with.

@@ -296,6 +296,9 @@ class AutopilotLink:
         go."""
         data = text.encode("ascii", "replace")[:200]
         parts = [data[i : i + 50] for i in range(0, len(data), 50)] or [b""]
+        if len(parts) > 1 and len(parts[-1]) == 50:
+            # Only a null character tells that a part is the last (MAVLink, STATUSTEXT); a full one has no room for it.
+            parts.append(b"")
         with self._lock:
             # Id 0 says that a text is whole; others tie its parts together.
             self._text_id = self._text_id % 65535 + 1
