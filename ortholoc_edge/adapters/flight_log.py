@@ -50,8 +50,8 @@ HEADER_NAME = "ortholoc"
 FRAME_TOPIC, CAMERA_TOPIC = "/ortholoc/frame", "/camera"
 _S = 1_000_000_000
 
-# Frames without loss are of a megabyte, and a disk that hangs must not fill the memory.
-_QUEUE_LENGTH = 24
+# Frames are of megabytes, and a disk that hangs must not fill the memory.
+_QUEUE_LENGTH = 12
 _CLOSE_WAIT_S = 5.0
 _SYNC_EVERY_NS = 1 * _S
 # Where a file could not be written, the next is tried this long after.
@@ -111,11 +111,12 @@ LoggedStep = tuple[Outcome, VehicleState, Circumstances]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Entry:
-    """A frame on its way to the disk; `place` is latitude, longitude (deg) and height above the ellipsoid (m)."""
+    """A frame on its way to the disk; ``place`` is latitude, longitude (deg) and height above the ellipsoid (m)."""
 
     frame: Frame | None
-    record: FrameRecord | None
     outcome: Outcome
+    step: LoggedStep | None
+    sequence: int
     place: tuple[float, float, float] | None
 
 
@@ -177,12 +178,8 @@ class FlightLog:
             outcome: as published.
             step: None where it was not localized.
         """
-        record = None
-        if step is not None:
-            assert frame is not None
-            record = frame_record(self._sequence, frame.name, *step)
-            self._sequence += 1
-        self._hand_over(_Entry(frame, record, outcome, self._place(outcome)))
+        self._hand_over(_Entry(frame, outcome, step, self._sequence, self._place(outcome)))
+        self._sequence += step is not None
 
     def note(self, stamp_ns: int, statistics: Mapping[str, Any]) -> None:
         """Hand over the counters; returns at once."""
@@ -271,9 +268,10 @@ class FlightLog:
         if image is not None:
             form, data = image
             file.add("camera", unix_ns, _image_message(form, data, unix_ns))
-        if entry.record is not None:
+        if entry.step is not None:
+            name = "" if entry.frame is None else entry.frame.name
             whole = image is not None and image[0] == "png"
-            file.add("frame", unix_ns, msgspec.json.encode(msgspec.structs.replace(entry.record, whole=whole)))
+            file.add("frame", unix_ns, msgspec.json.encode(frame_record(entry.sequence, name, whole, *entry.step)))
 
     def _encoded(self, image: ImageArray) -> tuple[str, bytes] | None:
         """None where none is wanted, or it is no picture: then it was refused, too."""

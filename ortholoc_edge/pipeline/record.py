@@ -103,7 +103,7 @@ class FrameRecord(Struct, frozen=True, kw_only=True):
 
 
 def frame_record(
-    sequence: int, name: str, outcome: Outcome, state: VehicleState, circumstances: Circumstances
+    sequence: int, name: str, whole: bool, outcome: Outcome, state: VehicleState, circumstances: Circumstances
 ) -> FrameRecord:
     """What `Navigator.step_again` needs."""
     prior, mount = circumstances.prior, state.mount
@@ -111,7 +111,7 @@ def frame_record(
         sequence=sequence,
         name=name,
         stamp_ns=state.stamp_ns,
-        whole=False,
+        whole=whole,
         ned_from_body=None if state.ned_from_body is None else state.ned_from_body.tolist(),
         attitude_sigma_rad=list(state.attitude_sigma_rad),
         odometry_ned_m=None if state.odometry_ned_m is None else state.odometry_ned_m.tolist(),
