@@ -51,7 +51,7 @@ def main() -> None:
     parser.add_argument("pack", type=Path)
     args = parser.parse_args()
     table = fixes(args.flights, args.pack)
-    unsettled = 2.0 * table[:, 0] * (1.0 - table[:, 1])
+    unsettled = 1.25 * table[:, 0] * (1.0 - table[:, 1])
     print("| unsettled m | fixes | error E, N, U rms m | says m | attitude rms deg | says deg | NEES/dof pose | position | attitude |")
     print("|---|---|---|---|---|---|---|---|---|")
     limits = np.quantile(unsettled, [0.0, 0.25, 0.5, 0.75, 0.9, 1.0])

@@ -11,8 +11,8 @@ from ortholoc_edge.geometry.grid import RasterGrid
 # Crowns, hedges and walls are rough over this length; slopes and roofs are not.
 _ROUGH_OVER_M = 4.0
 _CELL_M = 1.0
-# Fitted on 4718 fixes over an old generated map with woods (docs/studies/covariance.md).
-_OF_ROUGHNESS = 2.0
+# Fitted on 9420 fixes over an old generated map with woods (docs/studies/covariance.md).
+_OF_ROUGHNESS = 1.25
 
 
 def unsettled_m(dsm: Float32Array, grid: RasterGrid, points_map: FloatArray, agreeing: float) -> float:

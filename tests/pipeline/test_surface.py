@@ -45,7 +45,7 @@ def test_half_a_wood_counts_half() -> None:
 def test_what_agrees_is_settled(agreeing: float) -> None:
     wood = heights("wood")
     assert unsettled_m(wood, GRID, points(), agreeing) == pytest.approx(
-        2.0 * (1.0 - agreeing) * roughness_m(wood, GRID, points())
+        1.25 * (1.0 - agreeing) * roughness_m(wood, GRID, points())
     )
 
 
