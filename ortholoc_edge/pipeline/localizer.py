@@ -708,7 +708,10 @@ class Localizer:
 
     def _pose(self, points_local: FloatArray, query_px: FloatArray) -> pnp.PoseEstimate | None:
         if self._options.calibrate:
-            return calibrate.solve(points_local, query_px, self.camera)
+            found = calibrate.solve([calibrate.View(points_local, query_px)], self.camera.pinhole())
+            estimate = None if found is None else found.views[0]
+            # The pixels are those without distortion, which stays as it was configured.
+            return estimate and replace(estimate, camera=replace(estimate.camera, distortion=self.camera.distortion))
         return pnp.solve(points_local, query_px, self.camera, max_error_px=self._max_error_px)
 
     # -- judgement -------------------------------------------------------------------------------------
