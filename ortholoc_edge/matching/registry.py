@@ -7,10 +7,13 @@ from typing import Final
 
 from ortholoc_edge.errors import ConfigError
 from ortholoc_edge.matching import models
+from ortholoc_edge.matching.binary import BinaryMatcher
 from ortholoc_edge.matching.sift import SiftMatcher
 from ortholoc_edge.matching.types import STRUCTURAL, AnyMatcher, Matcher, Structural
 
-MATCHERS: Final = ("xfeat", "xfeat-star", "xfeat-lighterglue", "sift")
+# Without weights; which of them OpenCV lacks, `binary.unavailable` says.
+BINARY: Final = ("orb", "akaze")
+MATCHERS: Final = ("xfeat", "xfeat-star", "xfeat-lighterglue", "sift", *BINARY)
 # Ways to match a frame with the map: those, structural matching, and structural matching with one of those for frames
 # that it can't place.
 METHODS: Final = (STRUCTURAL, *(f"{STRUCTURAL}+{name}" for name in MATCHERS), *MATCHERS)
@@ -65,7 +68,7 @@ def make_matcher(
         name: one of ``MATCHERS``.
         working_px: long side that images are brought to.
         max_keypoints: per image; LighterGlue takes no more than `lighterglue.MOST_KEYPOINTS`.
-        threads: of one inference; SIFT takes OpenCV's setting (``cv2.setNumThreads``).
+        threads: of one inference; SIFT, ORB and AKAZE take OpenCV's setting (``cv2.setNumThreads``).
         model_path: a model file instead of the store's; not for matchers that run two.
         model_sha256: hash that the file must have; None: the record beside the file says it.
         progress: told of a build's steps.
@@ -81,6 +84,10 @@ def make_matcher(
             if model_path is not None:
                 raise ConfigError(f"matcher 'sift' uses no model; leave {model_path} away")
             return SiftMatcher(working_px=working_px, max_keypoints=max_keypoints)
+        if name in BINARY:
+            if model_path is not None:
+                raise ConfigError(f"matcher {name!r} uses no model; leave {model_path} away")
+            return BinaryMatcher(name, working_px=working_px, max_keypoints=max_keypoints)
         if name in _PAIRED:
             if model_path is not None:
                 raise ConfigError(
