@@ -47,6 +47,11 @@ _ENOUGH = 0.999
 # Of the focal length over the long side of the image: fields of view from 118 down to 6 degrees. Where it is not
 # determined it runs away, and is held there.
 _PLAUSIBLE_FOCAL = (0.3, 10.0)
+# On the variance, for errors of map and matches that vary slowly: what they don't move in a pose of known intrinsics
+# (`pnp.ABSORBED_ERROR_FACTOR`), the focal length takes up, which is told by little. With that factor alone the
+# normalised error squared averaged 3.6 instead of 1 (three flights jointly, SIFT and XFeat; docs/benchmarks.md,
+# "Calibration").
+_ABSORBED_ERROR_FACTOR = 2.5 * pnp.ABSORBED_ERROR_FACTOR
 # Of a squared normal variable.
 _MEDIAN_CHI_SQUARED = 0.455
 # Worse heights than this are no map.
@@ -337,7 +342,7 @@ class _Taken:
 
     @property
     def inflation(self) -> float:
-        return self.variance * self.alike * pnp.ABSORBED_ERROR_FACTOR
+        return self.variance * self.alike * _ABSORBED_ERROR_FACTOR
 
 
 @dataclass(frozen=True, slots=True, eq=False)

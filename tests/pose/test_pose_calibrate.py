@@ -85,8 +85,8 @@ def test_never_a_wrong_calibration():
         assert abs(math.log(found.camera.fx / TRUE.fx)) < 3.5 * calibrate.MAX_RELATIVE_FOCAL_SIGMA
         squared.append(in_sigmas(found, TRUE)["log_focal"] ** 2)
     assert 2 <= refused <= 7
-    # The factor for errors that the pose absorbs, of which there are none here, makes it 0.4 to 0.5.
-    assert 0.15 < np.mean(squared) < 1.5
+    # The factor for errors that vary slowly, of which there are none here, makes it about 0.2.
+    assert 0.05 < np.mean(squared) < 0.6
 
 
 @pytest.mark.parametrize("outliers", [0.0, 0.5])
