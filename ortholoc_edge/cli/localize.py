@@ -31,7 +31,7 @@ from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.store import MapStore
 
 # Larger packs are not searched whole: that is area search, not localization.
-_MAX_UNAIDED_SIDE_M = 1000.0
+MAX_UNAIDED_SIDE_M = 1000.0
 _UNKNOWN_HEADING_SIGMA_RAD = math.pi
 _ASSUMED_TILT_SIGMA_DEG = 10.0
 
@@ -42,7 +42,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="localize one photo",
         description="One photo, one answer. With --position the search starts there; with --attitude too, in the "
         "predicted view. Without either the whole pack is the region, in four rotations, if it is no larger than "
-        f"{_MAX_UNAIDED_SIDE_M:.0f} m. Exit code 0: a fix; 1: none.",
+        f"{MAX_UNAIDED_SIDE_M:.0f} m. Exit code 0: a fix; 1: none.",
     )
     parser.add_argument("image", type=Path, metavar="IMAGE")
     parser.add_argument("--pack", type=Path, required=True)
@@ -150,13 +150,13 @@ def _prior(args: argparse.Namespace, store: MapStore) -> PosePrior | RegionPrior
             raise ConfigError("--attitude needs --position or --geodetic beside it")
         west, south, east, north = store.bounds
         side_m = max(east - west, north - south)
-        if side_m > _MAX_UNAIDED_SIDE_M:
+        if side_m > MAX_UNAIDED_SIDE_M:
             return Rejected(
                 0,
                 Reason.NO_PRIOR,
                 "the pack is too large to be searched whole; give --position; side, m",
                 side_m,
-                _MAX_UNAIDED_SIDE_M,
+                MAX_UNAIDED_SIDE_M,
             )
         return RegionPrior(store.bounds)
     position = np.array(position, dtype=np.float64)

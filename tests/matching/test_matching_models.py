@@ -199,7 +199,8 @@ def test_another_graph_is_refused() -> None:
 
 def test_names_and_numbers_of_matchers_are_checked(tmp_path: Path, filled: Path) -> None:
     assert make_matcher("sift", working_px=512, max_keypoints=2048, threads=1).name == "sift"
-    with pytest.raises(ConfigError, match="known are: xfeat, xfeat-star, xfeat-lighterglue, sift"):
+    known = "known are: xfeat, xfeat-star, xfeat-lighterglue, aliked-lightglue, sift, orb, akaze"
+    with pytest.raises(ConfigError, match=known):
         make_matcher("surf", working_px=512, max_keypoints=2048, threads=1)
     with pytest.raises(ConfigError, match="multiple of 32"):
         make_matcher("xfeat", working_px=500, max_keypoints=2048, threads=1)
@@ -212,8 +213,9 @@ def test_names_and_numbers_of_matchers_are_checked(tmp_path: Path, filled: Path)
 def test_methods_are_matchers_and_structural_matching_with_and_without_one(tmp_path: Path) -> None:
     numbers = {"working_px": 512, "max_keypoints": 2048, "threads": 1}
     assert METHODS == (
-        "structural", "structural+xfeat", "structural+xfeat-star", "structural+xfeat-lighterglue", "structural+sift",
-        "xfeat", "xfeat-star", "xfeat-lighterglue", "sift",
+        "structural", "structural+xfeat", "structural+xfeat-star", "structural+xfeat-lighterglue",
+        "structural+aliked-lightglue", "structural+sift", "structural+orb", "structural+akaze",
+        "xfeat", "xfeat-star", "xfeat-lighterglue", "aliked-lightglue", "sift", "orb", "akaze",
     )  # fmt: skip
     alone = make_method("structural", **numbers)
     assert isinstance(alone, Structural)
