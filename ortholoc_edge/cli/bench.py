@@ -17,6 +17,7 @@ from tqdm import tqdm
 from ortholoc_edge.bench import metrics, sequence
 from ortholoc_edge.bench.replay import FrameResult, PriorKind, PriorNoise
 from ortholoc_edge.bench.runner import SAMPLES_PACK, prior_used, run_flight, run_samples, summarise
+from ortholoc_edge.bench.samples import sample_paths
 from ortholoc_edge.bench.sets import RecordedSet, find_sets
 from ortholoc_edge.cli.arguments import positive_int
 from ortholoc_edge.cli.progress import ProgressBar
@@ -133,7 +134,7 @@ def _frames(
 ) -> Iterator[FrameResult]:
     noise = PriorNoise()
     if store is None:
-        return run_samples(sequence.sample_paths(one.folder), matcher, options, kind, noise, seed)
+        return run_samples(sample_paths(one.folder), matcher, options, kind, noise, seed)
     return run_flight(sequence.read_flight(one.folder), store, matcher, options, kind, noise, seed)
 
 
