@@ -159,8 +159,8 @@ def find_samples(
         raise DatasetError(f"{source}: no .npz file there; {_FORMAT}")
     found = [one for one in every if (kinds is None or one.kind in kinds) and (splits is None or one.split in splits)]
     if not found:
-        have = sorted({f"{one.kind} in {one.split or 'no split'}" for one in every})
-        raise DatasetError(f"{source}: none of {len(every)} samples is of that kind and split; there are {', '.join(have)}")
+        have = ", ".join(sorted({f"{one.kind} in {one.split or 'no split'}" for one in every}))
+        raise DatasetError(f"{source}: none of {len(every)} samples is of that kind and split; there are {have}")
     return found
 
 
