@@ -237,7 +237,9 @@ def _refuse(path: Path, key: str, array: npt.NDArray[Any], expected: str) -> NoR
 def _camera(image: ImageArray, matrix: FloatArray, path: Path) -> Camera:
     height, width = image.shape[:2]
     try:
-        return Camera(width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+        return Camera(
+            width, height, float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])
+        )
     except ValueError as err:
         raise DatasetError(f"{path}: intrinsics: {err}; {_FORMAT}") from err
 
