@@ -258,7 +258,8 @@ def _cut(scenery: Scenery, local: LocalFrame, grid: RasterGrid) -> tuple[ImageAr
     corner = local.map_from_local([grid.west, grid.top, 0.0])
     scale = local.grid_scale
     there = replace(grid, west=float(corner[0]), top=float(corner[1]), dx=grid.dx * scale, dy=grid.dy * scale)
-    layers = scenery.layers(there.bounds, there.gsd_m)
+    # Beyond the edge too: the outermost pixels lie between pixels of the map.
+    layers = scenery.layers(there.crop(-2, -2, grid.width + 4, grid.height + 4).bounds, there.gsd_m)
     u, v = np.meshgrid(np.arange(grid.width), np.arange(grid.height))
     xy_map = there.map_from_px(np.stack([u, v], axis=-1))
     at = layers.dop_grid.px_from_map(xy_map).astype(np.float32)
