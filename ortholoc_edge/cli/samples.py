@@ -122,17 +122,18 @@ def _of_flight(
 
 def _simulate(args: argparse.Namespace) -> int:
     # Not at the top: every other command works without the simulation.
-    from ortholoc_sim.crossdomain import CrossDomain
+    from ortholoc_sim.crossdomain import CrossDomain, Kind
     from ortholoc_sim.samples import KINDS, simulated_samples
 
     location = args.location or f"S{args.seed:02d}"
     options = MakerOptions(seed=args.seed)
     folder = _folder(args)
+    place = CrossDomain(Kind.SAME, args.seed, *(round(side) for side in args.place))
     failed = 0
     for kind in dict.fromkeys(args.kind):
-        domain = CrossDomain(KINDS[kind], args.seed, *(round(side) for side in args.place))
         try:
-            failed |= _write(simulated_samples(domain, args.photos, location, options), args.photos, folder)
+            made = simulated_samples(place.of_kind(KINDS[kind]), args.photos, location, options)
+            failed |= _write(made, args.photos, folder)
         except ValueError as error:
             raise ConfigError(f"--place {args.place[0]:g} {args.place[1]:g}: {error}") from error
     return failed

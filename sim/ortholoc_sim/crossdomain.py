@@ -199,6 +199,12 @@ class CrossDomain:
         focal_px = float(np.random.default_rng([self.seed, 110]).uniform(*_FOCAL_PX))
         return Camera.from_focal(WIDTH_PX, HEIGHT_PX, round(focal_px, 1))
 
+    def of_kind(self, kind: Kind) -> CrossDomain:
+        """The same place in another kind, not made anew."""
+        other = replace(self, kind=kind)
+        vars(other)["place"] = self.place
+        return other
+
     def survey_scene(self) -> Scene:
         """The place when the map was flown."""
         return build_scene(replace(self.place.world, layout=survey_layout(self.place)), self.survey)

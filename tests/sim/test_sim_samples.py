@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,9 +23,7 @@ def samples() -> dict[SampleKind, Sample]:
     """The same pose in the kinds farthest apart."""
     found = {}
     for kind in (Kind.SAME, Kind.XDOPDSM):
-        domain = replace(DOMAIN, kind=kind)
-        vars(domain)["place"] = DOMAIN.place
-        [sample] = simulated_samples(domain, 1, "S05", OPTIONS)
+        [sample] = simulated_samples(DOMAIN.of_kind(kind), 1, "S05", OPTIONS)
         assert isinstance(sample, Sample)
         found[SampleFile.of(Path(f"{sample.name}.npz")).kind] = sample
     return found
