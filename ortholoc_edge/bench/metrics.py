@@ -145,7 +145,8 @@ class SampleError:
 
 class SampleSummary(Struct, frozen=True, kw_only=True):
     """The paper's columns over samples. Medians and percentiles are over all of them, those without a pose counting as
-    infinite (which JSON tells as null, like what was not measured); ``recall`` likewise."""
+    infinite (which JSON tells as null, like what was not measured); ``recall`` likewise. (The paper's code leaves those
+    out of its medians, but not out of recall.)"""
 
     samples: int
     without_pose: int

@@ -153,8 +153,8 @@ def find_samples(
     # Not what a killed run left half written in its hidden folder.
     below = (path for path in source.rglob("*.npz") if not path.parent.name.startswith(_SCRATCH))
     paths = [source] if source.suffix == ".npz" else sorted(below)
-    # Resolved, or a split's folder named "." would not be known as one.
-    every = [SampleFile.of(path.resolve()) for path in paths]
+    # Absolute, or a split's folder named "." would not be known as one; not resolved: a link's name is the sample's.
+    every = [SampleFile.of(path.absolute()) for path in paths]
     if not every:
         raise DatasetError(f"{source}: no .npz file there; {_FORMAT}")
     found = [one for one in every if (kinds is None or one.kind in kinds) and (splits is None or one.split in splits)]

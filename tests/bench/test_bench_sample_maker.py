@@ -230,6 +230,23 @@ class OlderPack(PackScenery):
         return replace(layers, dsm=layers.dsm + np.float32(1.0))
 
 
+class HoledPack(PackScenery):
+    """Whose surface is unknown east of the camera."""
+
+    def heights(self, xy_map: FloatArray) -> FloatArray:
+        return np.where(xy_map[:, 0] > POSE.translation[0], np.nan, super().heights(xy_map))
+
+
+def test_the_mesh_ends_where_the_surface_does() -> None:
+    holed = made(place=HoledPack(rendered.store()))
+    assert holed.vertices is not None
+    assert holed.faces is not None
+    assert np.isfinite(holed.vertices).all()
+    assert holed.vertices[:, 0].max() <= holed.map_from_camera.translation[0] + 1e-3
+    assert 100 < len(holed.vertices) < 1500
+    assert set(np.unique(holed.faces)) == set(range(len(holed.vertices)))
+
+
 def test_across_domains_the_truth_is_the_photos_and_the_map_is_the_maps() -> None:
     older = made(place=OlderPack(rendered.store()))
     points, _ = truth(older)
