@@ -20,6 +20,9 @@ from ortholoc_edge.tiles.window import MapLayers
 from ortholoc_sim.camera import Renderer
 from ortholoc_sim.crossdomain import CrossDomain, Kind
 
+# Parts of what a point is off that it is moved by, one after the other: the whole overshoots on steep crowns.
+_SETTLINGS = (1.0, 0.5, 0.25, 0.12, 0.5, 0.25, 0.12)
+
 KINDS = {SampleKind.SAME: Kind.SAME, SampleKind.XDOP: Kind.XDOP, SampleKind.XDOPDSM: Kind.XDOPDSM}
 
 
@@ -36,6 +39,7 @@ class SimulatedScenery:
 
     def points(self, camera: Camera, map_from_camera: Rigid3) -> FloatArray:
         points = self._renderer.view(camera, map_from_camera).points_map
+        self._settle(points, map_from_camera.translation)
         west, south, east, north = self._layers.dop_grid.bounds
         with np.errstate(invalid="ignore"):
             # The renderer goes on beyond the place with what is at its edge.
@@ -45,6 +49,23 @@ class SimulatedScenery:
     def heights(self, xy_map: FloatArray) -> FloatArray:
         scene, place = self._renderer.scene, self._domain.placement
         return bilinear(scene.surface, scene.spec.grid.px_from_map(xy_map - (place.west_m, place.south_m)))
+
+    def _settle(self, points: FloatArray, eye: FloatArray) -> None:
+        """Move points (H, W, 3) along their rays onto the surface: the renderer's end a few millimetres below it, which
+        no picture shows but poses by thousands of points do."""
+        off_m = self._above(points)
+        for share in _SETTLINGS:
+            part = share * off_m / (points[..., 2] - eye[2])
+            moved = points + (points - eye) * part[..., None]
+            moved_off_m = self._above(moved)
+            # Up a wall may be away from it.
+            better = np.abs(moved_off_m) < np.abs(off_m)
+            points[better], off_m[better] = moved[better], moved_off_m[better]
+
+    def _above(self, points: FloatArray) -> FloatArray:
+        """(H, W) how far the surface is above points (H, W, 3), m."""
+        heights = self.heights(points[..., :2].reshape(-1, 2)).reshape(points.shape[:2])
+        return np.asarray(heights - points[..., 2], dtype=np.float64)
 
     def layers(self, bounds_map: Bounds, gsd_m: float) -> MapLayers:
         return self._layers

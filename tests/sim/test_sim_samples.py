@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from ortholoc_sim.crossdomain import CrossDomain, Kind
-from ortholoc_sim.samples import simulated_samples
+from ortholoc_sim.samples import SimulatedScenery, simulated_samples
 
 from ortholoc_edge.bench.confidence import ConfidenceErrors, confidence_errors
 from ortholoc_edge.bench.ground_truth import GroundTruthMatcher, geometric_confidence
@@ -47,6 +47,17 @@ def test_points_are_on_their_pixels_rays(samples: dict[SampleKind, Sample]) -> N
         px = sample.camera.project(sample.map_from_camera.inverse().apply(points))
         assert np.nanmax(np.abs(px - np.stack([u, v], axis=-1))) < 0.01
         assert np.isfinite(px).mean() > 0.99
+
+
+def test_points_are_on_the_surface_on_average_too() -> None:
+    """The renderer's lie 3 mm below it; a pose by all of them would show that."""
+    layers, renderer = DOMAIN.map_and_renderer()
+    scenery = SimulatedScenery(DOMAIN, layers, renderer)
+    points = scenery.points(DOMAIN.camera.resized(160, 120), DOMAIN.poses(1)[0]).reshape(-1, 3)
+    off_m = scenery.heights(points[:, :2]) - points[:, 2]
+    near = np.abs(off_m) < 0.02
+    assert near.mean() > 0.97
+    assert abs(off_m[near].mean()) < 2e-4
 
 
 def test_kinds_are_of_one_pose_and_differ_in_map_and_look(samples: dict[SampleKind, Sample]) -> None:
