@@ -30,6 +30,7 @@ from ortholoc_edge.bench.replay import (
     paper_region,
 )
 from ortholoc_edge.bench.runner import build_sample_pack, localizers, run_flight, true_ground
+from ortholoc_edge.bench.samples import read_sample, sample_paths
 from ortholoc_edge.bench.sets import RecordedSet
 from ortholoc_edge.errors import DatasetError
 from ortholoc_edge.geometry.arrays import ImageArray
@@ -165,10 +166,10 @@ def build_sites(one: RecordedSet, scratch: Path) -> list[Site]:
         pack = build_pack(one.dop, one.dsm, scratch / one.name, PackOptions(quality=85, vertical="unknown"))
         return [Site(one.name, one.place, one.folder, pack.path)]
     sites = []
-    for path in sequence.sample_paths(one.folder):
+    for path in sample_paths(one.folder):
         folder = scratch / f"{one.name} {path.stem}"
         folder.mkdir()
-        sites.append(Site(one.name, one.place, path, build_sample_pack(sequence.read_sample(path), folder).path))
+        sites.append(Site(one.name, one.place, path, build_sample_pack(read_sample(path), folder).path))
     return sites
 
 
@@ -195,7 +196,7 @@ def _flight_views(site: Site, store: MapStore, query_px: int | None) -> list[Vie
 
 
 def _sample_view(site: Site, store: MapStore, query_px: int | None) -> View:
-    sample = sequence.read_sample(site.source)
+    sample = read_sample(site.source)
     pose = sample.map_from_camera
     record = sequence.RecordedFrame(
         sample.name, site.source, 0, sample.camera, pose, sequence.attitude_of(pose, convergence_rad=0.0)

@@ -12,6 +12,7 @@ from msgspec import Struct
 
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import FloatArray
+from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.covariance import mahalanobis_squared
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Rejected
@@ -35,10 +36,16 @@ class Spread(Struct, frozen=True):
 
     @staticmethod
     def of(values: npt.ArrayLike) -> Spread:
+        """Of errors, which may be infinite. Between a finite one and an infinite one all is infinite."""
         array = np.asarray(values, dtype=np.float64)
         if not array.size:
             return Spread(None, None, None, None)
-        median, p90, p99 = np.percentile(array, [50, 90, 99])
+        ranks = [50, 90, 99]
+        # NumPy's interpolation beside infinity is NaN.
+        largest = array[np.isfinite(array)].max(initial=0.0)
+        found = np.percentile(np.minimum(array, largest), ranks)
+        found[np.isinf(np.percentile(array, ranks, method="higher"))] = np.inf
+        median, p90, p99 = found
         return Spread(float(median), float(p90), float(p99), float(array.max()))
 
 
@@ -117,8 +124,99 @@ def pose_error(fix: Fix, truth: Rigid3) -> PoseError:
     )
 
 
+@dataclass(frozen=True, slots=True)
+class SampleError:
+    """The paper's errors of one sample, all infinite where there is nothing to measure them on, so that giving up
+    can't raise a score.
+
+    Attributes:
+        me_px: median distance of the matches from where they should be, pixels of the orthophoto.
+        te_m, re_deg: of the pose.
+        rpe_px: median distance of the sample's keypoints, projected, from where the true pose projects them.
+        rfe: relative error of the focal length; None where it was given.
+    """
+
+    me_px: float
+    te_m: float
+    re_deg: float
+    rpe_px: float
+    rfe: float | None = None
+
+
+class SampleSummary(Struct, frozen=True, kw_only=True):
+    """The paper's columns over samples. Medians and percentiles are over all of them, those without a pose counting as
+    infinite (which JSON tells as null, like what was not measured); ``recall`` likewise. (The paper's code leaves those
+    out of its medians, but not out of recall.)"""
+
+    samples: int
+    without_pose: int
+    me_px: Spread
+    te_m: Spread
+    re_deg: Spread
+    rpe_px: Spread
+    rfe: Spread
+    recall: dict[str, float]
+
+    @staticmethod
+    def of(errors: Sequence[SampleError]) -> SampleSummary:
+        return SampleSummary(
+            samples=len(errors),
+            without_pose=sum(not np.isfinite(e.te_m) for e in errors),
+            me_px=Spread.of([e.me_px for e in errors]),
+            te_m=Spread.of([e.te_m for e in errors]),
+            re_deg=Spread.of([e.re_deg for e in errors]),
+            rpe_px=Spread.of([e.rpe_px for e in errors]),
+            rfe=Spread.of([e.rfe for e in errors if e.rfe is not None]),
+            recall=recall(errors, len(errors)),
+        )
+
+
+def translation_error_m(estimate: Rigid3, truth: Rigid3) -> float:
+    """Between the camera centres of two ``map_from_camera``, in map units."""
+    return float(np.linalg.norm(estimate.translation - truth.translation))
+
+
+def rotation_error_deg(estimate: Rigid3, truth: Rigid3) -> float:
+    """Angle of the turn between two ``map_from_camera``."""
+    return float(np.degrees(rotation.angle_between(estimate.rotation, truth.rotation)))
+
+
+def reprojection_errors_px(
+    points_map: FloatArray, estimate: Rigid3, truth: Rigid3, camera: Camera, estimated_camera: Camera | None = None
+) -> FloatArray:
+    """How far from its place in the photo each point (N, 3) would be drawn, px.
+
+    Args:
+        estimate, truth: ``map_from_camera``. (The paper's code projects with this as if it were its inverse.)
+        camera: true intrinsics. estimated_camera: those that belong to the estimate; None: the true ones.
+    Returns: (M,) for the points that are in front of the true camera; infinite behind the estimated one.
+    """
+    true_px = camera.project(truth.inverse().apply(points_map))
+    in_front = np.isfinite(true_px).all(axis=1)
+    drawn_px = (estimated_camera or camera).project(estimate.inverse().apply(points_map[in_front]))
+    errors = np.linalg.norm(drawn_px - true_px[in_front], axis=1)
+    return np.asarray(np.nan_to_num(errors, nan=np.inf), dtype=np.float64)
+
+
+def matching_errors_px(map_px: FloatArray, true_map_px: FloatArray) -> FloatArray:
+    """Distances of matched pixels (N, 2) of the orthophoto from the true ones, px: (M,), of those whose truth is known
+    (not NaN)."""
+    errors = np.linalg.norm(map_px - true_map_px, axis=1)
+    return np.asarray(errors[np.isfinite(errors)], dtype=np.float64)
+
+
+def relative_focal_error(estimate: Camera, truth: Camera) -> float:
+    """The paper's RFE, as a part of 1: the mean of both axes'."""
+    return 0.5 * (abs(estimate.fx - truth.fx) / truth.fx + abs(estimate.fy - truth.fy) / truth.fy)
+
+
+def median_error(errors: FloatArray) -> float:
+    """Infinite of none."""
+    return float(np.median(errors)) if len(errors) else float("inf")
+
+
 def recall(
-    errors: Sequence[PoseError], frames: int, limits: Mapping[str, tuple[float, float]] = RECALL_LIMITS
+    errors: Sequence[PoseError | SampleError], frames: int, limits: Mapping[str, tuple[float, float]] = RECALL_LIMITS
 ) -> dict[str, float]:
     """Part of all frames with a fix within each pair of limits (m, deg)."""
     return {

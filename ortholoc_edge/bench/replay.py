@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from ortholoc_edge.bench import sequence
 from ortholoc_edge.bench.metrics import PoseError, pose_error
+from ortholoc_edge.bench.samples import Sample
 from ortholoc_edge.errors import CameraError, ConfigError
 from ortholoc_edge.geometry import covariance as cov
 from ortholoc_edge.geometry import frames, rotation
@@ -257,7 +258,7 @@ def _tracker_options(noise: PriorNoise) -> TrackerOptions:
 
 
 def replay_sample(
-    sample: sequence.Sample,
+    sample: Sample,
     localizer: Localizer,
     *,
     kind: PriorKind,

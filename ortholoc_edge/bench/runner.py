@@ -13,6 +13,7 @@ from affine import Affine
 
 from ortholoc_edge.bench import metrics, report, sequence
 from ortholoc_edge.bench.replay import FrameResult, PriorKind, PriorNoise, replay_flight, replay_sample
+from ortholoc_edge.bench.samples import Sample, read_sample
 from ortholoc_edge.errors import DatasetError, MapError
 from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.camera import Camera
@@ -89,7 +90,7 @@ def run_samples(
     Raises: DatasetError for a sample that can't be read or whose place is not on the pack.
     """
     for index, path in enumerate(paths):
-        sample = sequence.read_sample(path)
+        sample = read_sample(path)
         with sample_store(sample) if pack is None else nullcontext(pack) as store:
             localizer = Localizer(sample.camera, store, matcher, options)
             ground_m = true_ground(store, sample.map_from_camera.translation[:2])
@@ -119,7 +120,7 @@ def true_ground(store: MapStore, xy_map: FloatArray) -> float:
 
 
 @contextmanager
-def sample_store(sample: sequence.Sample) -> Iterator[MapStore]:
+def sample_store(sample: Sample) -> Iterator[MapStore]:
     """A sample's rasters as an area pack without a reference system, for as long as it is needed."""
     with (
         tempfile.TemporaryDirectory(prefix="ortholoc-sample-") as name,
@@ -128,7 +129,7 @@ def sample_store(sample: sequence.Sample) -> Iterator[MapStore]:
         yield store
 
 
-def build_sample_pack(sample: sequence.Sample, folder: Path) -> Pack:
+def build_sample_pack(sample: Sample, folder: Path) -> Pack:
     """A sample's rasters as an area pack without a reference system, in ``folder``/pack."""
     grid = sample.grid
     transform = Affine(grid.dx, 0.0, grid.west, 0.0, grid.dy, grid.top)

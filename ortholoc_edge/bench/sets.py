@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from ortholoc_edge.bench import sequence
+from ortholoc_edge.bench.samples import sample_paths
 from ortholoc_edge.errors import DatasetError
 
 
@@ -35,10 +35,10 @@ def find_sets(data: Path) -> list[RecordedSet]:
         dop, dsm = sorted(folder.glob("*_dop.tif")), sorted(folder.glob("*_dsm.tif"))
         if list(folder.glob("*_flight.csv")) and dop and dsm:
             found.setdefault(folder, RecordedSet(name, name, folder, dop[0], dsm[0]))
-        elif sequence.sample_paths(folder):
+        elif sample_paths(folder):
             found.setdefault(folder, RecordedSet(name, name, folder, None, None))
         samples = folder / "samples"
-        if sequence.sample_paths(samples):
+        if sample_paths(samples):
             found.setdefault(samples, RecordedSet(f"{name} samples", name, samples, None, None))
     if not found:
         raise DatasetError(f"{data}: no set there; see docs/sequences.md")

@@ -1,4 +1,4 @@
-"""``bench``: the table of docs/benchmarks.md, measured."""
+"""``bench``: the table of docs/benchmarks.md, measured, and studies on samples."""
 
 from __future__ import annotations
 
@@ -17,10 +17,12 @@ from tqdm import tqdm
 from ortholoc_edge.bench import metrics, sequence
 from ortholoc_edge.bench.replay import FrameResult, PriorKind, PriorNoise
 from ortholoc_edge.bench.runner import SAMPLES_PACK, prior_used, run_flight, run_samples, summarise
+from ortholoc_edge.bench.samples import sample_paths
 from ortholoc_edge.bench.sets import RecordedSet, find_sets
+from ortholoc_edge.cli import bench_study
 from ortholoc_edge.cli.arguments import positive_int
 from ortholoc_edge.cli.progress import ProgressBar
-from ortholoc_edge.errors import OrtholocError
+from ortholoc_edge.errors import ConfigError, OrtholocError
 from ortholoc_edge.matching.registry import METHODS, make_method
 from ortholoc_edge.matching.types import AnyMatcher
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
@@ -61,10 +63,15 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )  # fmt: skip
     parser.add_argument("--max-keypoints", type=positive_int, default=4096, help="default: %(default)s")
     parser.add_argument("--json", action="store_true", help="print one JSON object per row instead of the table")
+    bench_study.add_arguments(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
+    if args.study is not None:
+        return bench_study.run(args)
+    if args.kinds or args.splits:
+        raise ConfigError("--kinds and --splits are of studies; name one with --study, or leave them out")
     found = find_sets(args.data)
     # Before the sets: what is wrong here is wrong for all of them.
     matchers = {name: _matcher(name, args) for name in args.matchers}
@@ -133,7 +140,7 @@ def _frames(
 ) -> Iterator[FrameResult]:
     noise = PriorNoise()
     if store is None:
-        return run_samples(sequence.sample_paths(one.folder), matcher, options, kind, noise, seed)
+        return run_samples(sample_paths(one.folder), matcher, options, kind, noise, seed)
     return run_flight(sequence.read_flight(one.folder), store, matcher, options, kind, noise, seed)
 
 

@@ -18,6 +18,7 @@ from ortholoc_edge.bench.draw import write_png
 from ortholoc_edge.bench.flight_log import compare, log_files, read_frames, read_header, repeat
 from ortholoc_edge.bench.replay import FrameResult, Length, PriorKind, PriorNoise
 from ortholoc_edge.bench.runner import SAMPLES_PACK, prior_used, run_flight, run_samples, summarise
+from ortholoc_edge.bench.samples import sample_paths
 from ortholoc_edge.cli import matcher_options
 from ortholoc_edge.cli.arguments import length, non_negative, seed, sigma_triple, writable_folder
 from ortholoc_edge.config import config_from_text
@@ -147,7 +148,7 @@ def _replay(args: argparse.Namespace) -> int:
         args.odometer_drift,
     )
     options = LocalizerOptions(adhop=not args.no_adhop, precomputed_features=args.features)
-    samples = sequence.sample_paths(args.sequence)
+    samples = sample_paths(args.sequence)
     kind = prior_used(PriorKind(args.prior), bool(samples))
     if not args.sequence.exists():
         raise DatasetError(f"{args.sequence}: no such file or folder")

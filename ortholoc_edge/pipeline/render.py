@@ -14,6 +14,7 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, ImageArray
 from ortholoc_edge.geometry.camera import Camera
@@ -28,6 +29,10 @@ _NODE_PX = 4
 # A ray may pass this many cells of the surface model from one look at it to the next, and looks so often at most.
 _CELLS_PER_STEP = 2.0
 _MIN_STEPS, _MAX_STEPS = 3, 32
+# Of `surface_points`, which may take its time.
+_EXACT_CELLS_PER_STEP = 0.5
+_BISECTIONS = 14
+_MARGIN_M = 0.5
 # Looks at the surface once more where the ray met it, so that even slopes are exact.
 _POLISHES = 2
 # Picture of the map that is drawn from: the coarsest that has no larger pixels than the view, times this.
@@ -154,26 +159,14 @@ def render(terrain: Terrain, camera: Camera, local_from_camera: Rigid3) -> Rende
     Returns: a view that is invalid above the horizon, beyond `prior.MAX_RANGE_HEIGHTS` heights, off the window and
         where orthophoto or surface have no data.
     """
-    grid, local = terrain.grid, terrain.local
+    grid = terrain.grid
     columns, rows = (-(-side // _NODE_PX) + 2 for side in (camera.width, camera.height))
     first = 0.5 * _NODE_PX - 0.5 - _NODE_PX
-    u, v = np.meshgrid(first + _NODE_PX * np.arange(columns), first + _NODE_PX * np.arange(rows))
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
-    east, north, up = np.moveaxis(rays @ local_from_camera.rotation.T, -1, 0)
-    centre = local_from_camera.translation
-    ahead = -up * MAX_RANGE_HEIGHTS >= 1.0
-    # Cells of the surface model per metre of fall.
-    falling = np.where(ahead, -up, 1.0)
-    slope_x = (np.where(ahead, east, 0.0) / falling * (local.grid_scale / grid.dx)).astype(np.float32)
-    slope_y = (np.where(ahead, north, 0.0) / falling * (local.grid_scale / grid.dy)).astype(np.float32)
-    start = local.map_from_local(centre)
-    x0, y0 = (np.float32(value) for value in grid.px_from_map(start[:2]))
-    fall = _first_hits(terrain, float(centre[2]), ahead, slope_x, slope_y, x0, y0)
-    x, y = x0 + slope_x * fall, y0 + slope_y * fall
-    seen = ahead & (x >= 0) & (x <= grid.width - 1) & (y >= 0) & (y <= grid.height - 1)
-    if terrain.known is not None:
-        # A surface beside a hole is half invented.
-        seen &= cv2.remap(terrain.known, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT) > 0.999
+    nodes = (first + _NODE_PX * np.arange(count) for count in (columns, rows))
+    rays = _rays(terrain, camera, local_from_camera, *nodes)
+    fall = _first_hits(terrain, rays)
+    x, y = rays.x0 + rays.slope_x * fall, rays.y0 + rays.slope_y * fall
+    seen = rays.ahead & _is_known(terrain, x, y)
     picture = _picture_for(terrain, float(np.median(fall)) / camera.focal_px)
     # Half pixels: both grids count from the centres of their first cells.
     to_x, to_y = grid.dx / picture.grid.dx, grid.dy / picture.grid.dy
@@ -192,37 +185,101 @@ def render(terrain: Terrain, camera: Camera, local_from_camera: Rigid3) -> Rende
     return RenderedView(np.asarray(image, dtype=np.uint8), valid, camera, local_from_camera, fall)
 
 
-def _first_hits(
-    terrain: Terrain,
-    height_m: float,
-    ahead: BoolArray,
-    slope_x: Float32Array,
-    slope_y: Float32Array,
-    x0: np.float32,
-    y0: np.float32,
-) -> Float32Array:
-    """Fall (h, w) at which the rays first meet the surface."""
+def surface_points(terrain: Terrain, camera: Camera, local_from_camera: Rigid3) -> FloatArray:
+    """Points (H, W, 3) of the surface, local m, that the pixels show, each on its pixel's own ray: slow and exact, to
+    make ground truth with.
 
-    def above(fall: Float32Array | np.float32) -> Float32Array:
-        """How far above the surface rays are that have fallen so far, m."""
-        heights = cv2.remap(
-            terrain.heights, x0 + slope_x * fall, y0 + slope_y * fall, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
-        return np.asarray(np.float32(height_m) - fall - heights, dtype=np.float32)
+    Args:
+        camera: its distortion is ignored.
+    Returns: NaN where a ray meets no known surface: above the horizon, beyond `prior.MAX_RANGE_HEIGHTS` heights, off
+        the window, at holes, and where the camera is in the ground.
+    """
+    rays = _rays(terrain, camera, local_from_camera, np.arange(camera.width), np.arange(camera.height))
+    fall = _exact_hits(terrain, rays)
+    east, north, falling = rays.directions
+    points = np.stack([east / falling * fall, north / falling * fall, -fall], axis=-1) + local_from_camera.translation
+    x, y = rays.x0 + rays.slope_x * fall, rays.y0 + rays.slope_y * fall
+    seen = rays.ahead & np.isfinite(fall) & _is_known(terrain, x, y)
+    return np.where(seen[..., None], points, np.nan)
 
-    deepest = max(height_m - terrain.lowest_m, 1e-3)
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rays:
+    """Rays (h, w) of a camera over the surface model's cells.
+
+    Attributes:
+        height_m: where they start.
+        ahead: (h, w) whether they go down steeply enough to be followed.
+        directions: east, north and fall, each (h, w) float64; of rays that are not ahead 0, 0 and 1.
+        slope_x, slope_y: (h, w) cells per metre of fall.
+        x0, y0: start, cells.
+    """
+
+    height_m: float
+    ahead: BoolArray
+    directions: tuple[FloatArray, FloatArray, FloatArray]
+    slope_x: Float32Array
+    slope_y: Float32Array
+    x0: np.float32
+    y0: np.float32
+
+    def above(self, heights: Float32Array, fall: Float32Array | np.float32) -> Float32Array:
+        """How far above a surface (cells by cells) rays are that have fallen so far, m."""
+        below = cv2.remap(
+            heights, self.x0 + self.slope_x * fall, self.y0 + self.slope_y * fall, cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        )  # fmt: skip
+        return np.asarray(np.float32(self.height_m) - fall - below, dtype=np.float32)
+
+
+def _rays(
+    terrain: Terrain, camera: Camera, local_from_camera: Rigid3, columns: npt.ArrayLike, rows: npt.ArrayLike
+) -> _Rays:
+    """Through the pixels of some columns (w,) and rows (h,)."""
+    grid, local = terrain.grid, terrain.local
+    u, v = np.meshgrid(columns, rows)
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
+    east, north, up = np.moveaxis(rays @ local_from_camera.rotation.T, -1, 0)
+    ahead = -up * MAX_RANGE_HEIGHTS >= 1.0
+    east, north, falling = np.where(ahead, east, 0.0), np.where(ahead, north, 0.0), np.where(ahead, -up, 1.0)
+    centre = local_from_camera.translation
+    x0, y0 = (np.float32(value) for value in grid.px_from_map(local.map_from_local(centre)[:2]))
+    return _Rays(
+        float(centre[2]),
+        ahead,
+        (east, north, falling),
+        (east / falling * (local.grid_scale / grid.dx)).astype(np.float32),
+        (north / falling * (local.grid_scale / grid.dy)).astype(np.float32),
+        x0,
+        y0,
+    )
+
+
+def _is_known(terrain: Terrain, x: Float32Array, y: Float32Array) -> BoolArray:
+    """Whether the surface model has data at cells (h, w)."""
+    grid = terrain.grid
+    seen = (x >= 0) & (x <= grid.width - 1) & (y >= 0) & (y <= grid.height - 1)
+    if terrain.known is not None:
+        # A surface beside a hole is half invented.
+        seen &= cv2.remap(terrain.known, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT) > 0.999
+    return np.asarray(seen, dtype=np.bool_)
+
+
+def _first_hits(terrain: Terrain, rays: _Rays) -> Float32Array:
+    """Fall (h, w) at which the rays first meet the surface; those that do not meet it go to the lowest ground."""
+    deepest = max(rays.height_m - terrain.lowest_m, 1e-3)
     # A ravine far below must not let rays start in the ground that the camera flies over.
-    over_m = height_m - terrain.typical_m if height_m > terrain.typical_m else deepest
-    highest = min(max(height_m - terrain.highest_m, _CLEARANCE * over_m), deepest)
-    run = np.hypot(slope_x, slope_y)
-    cells = (deepest - highest) * float(np.percentile(run[ahead], 90)) if ahead.any() else 0.0
+    over_m = rays.height_m - terrain.typical_m if rays.height_m > terrain.typical_m else deepest
+    highest = min(max(rays.height_m - terrain.highest_m, _CLEARANCE * over_m), deepest)
+    run = np.hypot(rays.slope_x, rays.slope_y)
+    cells = (deepest - highest) * float(np.percentile(run[rays.ahead], 90)) if rays.ahead.any() else 0.0
     steps = int(np.clip(math.ceil(cells / _CELLS_PER_STEP), _MIN_STEPS, _MAX_STEPS))
     falls = np.linspace(highest, deepest, steps + 1).astype(np.float32)
-    fall = np.full(slope_x.shape, falls[-1], np.float32)
-    open_rays = ahead.copy()
-    before = above(falls[0])
+    fall = np.full(rays.slope_x.shape, falls[-1], np.float32)
+    open_rays = rays.ahead.copy()
+    before = rays.above(terrain.heights, falls[0])
     for low, high in pairwise(falls):
-        after = above(high)
+        after = rays.above(terrain.heights, high)
         hits = open_rays & (after <= 0)
         # Between two looks the ray and the surface are taken as straight.
         part = np.clip(before / np.maximum(before - after, np.float32(1e-6)), 0, 1)
@@ -233,9 +290,35 @@ def _first_hits(
             break
     reach = np.float32((deepest - highest) / steps)
     for _ in range(_POLISHES):
-        moved = above(fall)
+        moved = rays.above(terrain.heights, fall)
         np.copyto(fall, fall + moved, where=np.abs(moved) < reach)
     return fall
+
+
+def _exact_hits(terrain: Terrain, rays: _Rays) -> Float32Array:
+    """As `_first_hits`, looking at every half cell and then closing in; NaN where no ray comes from above to the
+    surface."""
+    # From above all there is to below it, so that every hit is a passage.
+    highest = max(rays.height_m - terrain.highest_m - _MARGIN_M, 0.0)
+    deepest = max(rays.height_m - terrain.lowest_m, 0.0) + _MARGIN_M
+    run = np.hypot(rays.slope_x, rays.slope_y)
+    cells = (deepest - highest) * float(np.percentile(run[rays.ahead], 99)) if rays.ahead.any() else 0.0
+    steps = max(math.ceil(cells / _EXACT_CELLS_PER_STEP), _MIN_STEPS)
+    falls = np.linspace(highest, deepest, steps + 1).astype(np.float32)
+    open_rays = rays.ahead & (rays.above(terrain.heights, falls[0]) > 0)
+    low = np.full(rays.slope_x.shape, np.nan, np.float32)
+    for start, end in pairwise(falls):
+        hits = open_rays & (rays.above(terrain.heights, end) <= 0)
+        low[hits] = start
+        open_rays &= ~hits
+        if not open_rays.any():
+            break
+    high = low + np.float32((deepest - highest) / steps)
+    for _ in range(_BISECTIONS):
+        middle = np.float32(0.5) * (low + high)
+        is_above = rays.above(terrain.heights, middle) > 0
+        low, high = np.where(is_above, middle, low), np.where(is_above, high, middle)
+    return np.asarray(np.float32(0.5) * (low + high), dtype=np.float32)
 
 
 def _picture_for(terrain: Terrain, gsd_m: float) -> _Picture:

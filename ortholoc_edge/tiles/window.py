@@ -51,3 +51,18 @@ class ColourWindow:
     rgb: ImageArray
     valid: BoolArray
     grid: RasterGrid
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapLayers:
+    """A map as a survey delivers it: orthophoto in colour and surface model, on grids of their own.
+
+    Attributes:
+        dop: (H, W, 3) uint8 RGB on ``dop_grid``; black where there is none.
+        dsm: (h, w) float32 heights on ``dsm_grid``, m; NaN where there is none.
+    """
+
+    dop: ImageArray
+    dop_grid: RasterGrid
+    dsm: Float32Array
+    dsm_grid: RasterGrid

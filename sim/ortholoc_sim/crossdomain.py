@@ -40,6 +40,7 @@ from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.grid import RasterGrid
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.tiles.georeference import Georeference, VerticalDatum
+from ortholoc_edge.tiles.window import MapLayers
 from ortholoc_sim.camera import Placement, Renderer, Sensor, View
 from ortholoc_sim.country import FRAME
 from ortholoc_sim.detail import Detail
@@ -130,21 +131,6 @@ class Flight:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MapLayers:
-    """The map.
-
-    Attributes:
-        dop: (H, W, 3) uint8 RGB on ``dop_grid``.
-        dsm: (h, w) float32 m on ``dsm_grid``.
-    """
-
-    dop: ImageArray
-    dop_grid: RasterGrid
-    dsm: Float32Array
-    dsm_grid: RasterGrid
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Photo:
     """A photo of a flight.
 
@@ -213,6 +199,12 @@ class CrossDomain:
         focal_px = float(np.random.default_rng([self.seed, 110]).uniform(*_FOCAL_PX))
         return Camera.from_focal(WIDTH_PX, HEIGHT_PX, round(focal_px, 1))
 
+    def of_kind(self, kind: Kind) -> CrossDomain:
+        """The same place in another kind, not made anew."""
+        other = replace(self, kind=kind)
+        vars(other)["place"] = self.place
+        return other
+
     def survey_scene(self) -> Scene:
         """The place when the map was flown."""
         return build_scene(replace(self.place.world, layout=survey_layout(self.place)), self.survey)
@@ -258,6 +250,13 @@ class CrossDomain:
         else:
             dsm = dsm + np.float32(_DSM_SIGMA_M) * white
         return MapLayers(np.asarray(dop, dtype=np.uint8), dop_grid, np.asarray(dsm, dtype=np.float32), dsm_grid)
+
+    def map_and_renderer(self) -> tuple[MapLayers, Renderer]:
+        """The map, and what draws the photos."""
+        scene = self.survey_scene()
+        flown = scene if self.looks_surveyed else self.flight_scene()
+        # The survey's half gigabyte is done with afterwards.
+        return self.layers(scene, (flown if self.kind is Kind.XDOP else scene).surface), self.renderer(flown)
 
     def poses(self, count: int) -> list[Rigid3]:
         """``map_from_camera`` of independent views: position, height above ground, heading and tilt by lot, such that
@@ -436,11 +435,8 @@ def write_set(out: Path, domain: CrossDomain, count: int, progress: bool = False
     poses = domain.poses(count)
     (out / "queries").mkdir(parents=True, exist_ok=True)
     name = out.resolve().name
-    scene = domain.survey_scene()
-    flown = scene if domain.looks_surveyed else domain.flight_scene()
-    _write_layers(out, name, domain.layers(scene, (flown if domain.kind is Kind.XDOP else scene).surface))
-    scene = flown  # the survey's half gigabyte is done with
-    renderer = domain.renderer(scene)
+    layers, renderer = domain.map_and_renderer()
+    _write_layers(out, name, layers)
     start = datetime(2024, 1, 1) + timedelta(days=domain.flown.season.day - 1, hours=9)
     spacing_m = domain.flown_as.spacing_m
     # Minutes apart where every photo stands for itself.

@@ -33,10 +33,11 @@ from ortholoc_edge.tiles.georeference import Georeference
 from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.store import MapStore
 from ortholoc_edge.tiles.vertical import derive_offsets
+from ortholoc_edge.tiles.window import MapLayers
 from ortholoc_sim import demo_pack_path
 from ortholoc_sim.camera import Placement, Renderer, Sensor
 from ortholoc_sim.country import CENTRE, FLIGHT, FRAME, SURVEYS, Country, Look, blocks
-from ortholoc_sim.crossdomain import DOP_GSD_M, DSM_GSD_M, CrossDomain, Kind, MapLayers
+from ortholoc_sim.crossdomain import DOP_GSD_M, DSM_GSD_M, CrossDomain, Kind
 from ortholoc_sim.lens import smear_kernel
 from ortholoc_sim.noise import blobs
 from ortholoc_sim.recorded import Light, scene_of_map

@@ -91,8 +91,8 @@ def test_error_statistics_are_the_stated_sigmas():
         )
     assert np.allclose(np.degrees(np.std(attitude, axis=0)), (0.8, 1.2, 4.0), rtol=0.08)
     assert np.allclose(np.std(position, axis=0), (3.0, 3.0, 5.0), rtol=0.08)
-    # 50 m in 5 s: 3 % of it, and 0.1 m/s.
-    assert np.allclose(np.std(odometry, axis=0), np.hypot(0.03 * 50.0, 0.5), rtol=0.08)
+    # 50 m in 5 s and a climb of 1 m: 3 % of these, and 0.1 m/s.
+    assert np.allclose(np.std(odometry, axis=0), np.hypot([1.5, 1.5, 0.03], 0.5), rtol=0.08)
     for errors in (attitude, position, odometry):
         assert (np.abs(np.mean(errors, axis=0)) < 4 * np.std(errors, axis=0) / np.sqrt(800)).all()
 

@@ -64,10 +64,11 @@ def position(truth: Rigid3 = TRUTH, off_m: tuple[float, float, float] = (3.0, -2
 
 HELP = [
     ["sim"], ["run"], ["doctor"], ["replay"], ["localize"], ["bench"], ["models", "build"], ["models", "list"],
-    ["tiles", "build"], ["tiles", "info"], ["tiles", "verify"],
+    ["tiles", "build"], ["tiles", "info"], ["tiles", "verify"], ["samples", "make"], ["samples", "simulate"],
+    ["samples", "draw"],
 ]  # fmt: skip
 # Their only arguments are required, or there are none.
-WITHOUT_DEFAULTS = ("run", "tiles verify")
+WITHOUT_DEFAULTS = ("run", "tiles verify", "samples draw")
 
 
 @pytest.mark.parametrize("command", HELP, ids=" ".join)
@@ -554,3 +555,73 @@ def test_what_cannot_be_calibrated_is_said(
     places = {"PHOTO": flight / "photos" / "frame_00.jpg", "SMALL": small, "FLIGHT": flight}
     assert run("calibrate-focal", *(places.get(str(one), one) for one in arguments)) == EXIT_CONFIG
     assert complaint in capsys.readouterr().err
+
+
+# -- samples -----------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def samples(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of one made sample, in the data set's layout; a second photo is off the map."""
+    folder = tmp_path_factory.mktemp("samples")
+    head, first, *_ = (flight / "rendered_flight.csv").read_text(encoding="utf-8").splitlines()
+    cells = first.split(",")
+    cells[head.split(",").index("utm_e")] = "700000"
+    (folder / "short").mkdir()
+    (folder / "short" / "short_flight.csv").write_text("\n".join([head, first, ",".join(cells)]), encoding="utf-8")
+    (folder / "short" / "photos").symlink_to(flight / "photos")
+    return folder
+
+
+def test_samples_are_made_of_a_flight_then_studied_and_drawn(
+    samples: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert run("samples", "make", PACK, samples / "short", samples / "out", "--split", "val") == 0
+    told = capsys.readouterr()
+    made = samples / "out" / "val" / "short_R0000.npz"
+    assert told.out.split() == [str(made)]
+    assert "short_R0001: 0 % of the photo shows the map" in told.err
+
+    assert run("bench", samples / "out", "--study", "confidence", "--splits", "val", "--json") == 0
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [(row["kind"], row["above"]) for row in rows] == [("R", 0.0), ("R", 0.5), ("R", 0.95), ("R", 0.99)]
+    assert rows[2]["errors"]["samples"] == 1
+    assert rows[2]["errors"]["te_m"]["median"] < 0.005
+    assert rows[2]["errors"]["re_deg"]["median"] < 0.005
+
+    assert run("samples", "draw", samples / "out", tmp_path) == 0
+    assert cv2.imread(str(tmp_path / "short_R0000.png")).shape[1] == 1920
+
+    # A sample that can't be read is told, the table is of the others.
+    (made.parent / "short_xDOP0000.npz").write_bytes(b"no archive")
+    capsys.readouterr()
+    assert run("bench", samples / "out", "--study", "confidence") == EXIT_FAILED
+    told = capsys.readouterr()
+    assert "| R | 1 | > 0.95 |" in told.out
+    assert "short_xDOP0000.npz: not a readable" in told.err
+    assert "1 of 2 samples failed" in told.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words", "code"),
+    [
+        (["bench", "nowhere", "--study", "confidence"], "nowhere: no .npz file", EXIT_FAILED),
+        (["bench", "nowhere", "--kinds", "R"], "name one with --study", EXIT_CONFIG),
+        (["samples", "draw", "nowhere", "out"], "nowhere: no .npz file", EXIT_FAILED),
+        (["samples", "make", PACK, "nowhere", "out"], "0 files named", EXIT_FAILED),
+    ],
+)
+def test_samples_say_what_is_wrong(
+    arguments: list[str], words: str, code: int, capsys: pytest.CaptureFixture[str],
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    assert run(*arguments) == code
+    assert words in capsys.readouterr().err
+
+
+def test_a_location_is_a_plain_name(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        run("samples", "make", PACK, "flight", "out", "--location", "../L01")
+    assert stop.value.code == 2
+    assert "'../L01' is not a name" in capsys.readouterr().err

@@ -17,7 +17,7 @@ from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.grid import RasterGrid, bilinear
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.prior import MAX_RANGE_HEIGHTS
-from ortholoc_edge.pipeline.render import RenderedView, Terrain, render
+from ortholoc_edge.pipeline.render import RenderedView, Terrain, render, surface_points
 from ortholoc_edge.tiles.georeference import LocalFrame
 from ortholoc_edge.tiles.window import MapWindow
 
@@ -612,3 +612,61 @@ def test_distortion_is_ignored() -> None:
     two = drawn(place, place.pose(40.0, 15.0), lens.pinhole())
     assert np.array_equal(one.image, two.image)
     assert math.isclose(float(one.fall_m.sum()), float(two.fall_m.sum()))
+
+
+# -- ground truth --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 35.0, 60.0])
+@pytest.mark.parametrize("surface", [house, wall, hills], ids=["house", "wall", "hills"])
+def test_surface_points_are_the_first_on_their_rays(surface: Surface, tilt_deg: float) -> None:
+    place = Place(surface, scale=0.9996, reach_m=220.0, dop_m=1.0)
+    window = place.window
+    view = drawn(place, place.pose(tilt_deg=tilt_deg, roll_deg=5.0), CAMERA, window)
+    every = surface_points(terrain_of(window, place.local), CAMERA, view.local_from_camera)
+    px = every_px(CAMERA, 5)
+    found = every[px[:, 1].astype(int), px[:, 0].astype(int)]
+    known = np.isfinite(found).all(axis=1)
+    # All but what is beyond eight heights; and nothing that is not seen.
+    assert known[view.valid[px[:, 1].astype(int), px[:, 0].astype(int)]].mean() > 0.99
+    back = CAMERA.project(view.local_from_camera.inverse().apply(found[known]))
+    assert np.abs(back - px[known]).max() < 1e-9
+    truth = cast(place, view, px[known], window.dsm, window.dsm_grid)
+    off = np.linalg.norm(found[known] - truth, axis=1)
+    # A ray that grazes an edge or a crest by less than half a cell may go on to what is behind.
+    assert np.quantile(off, 0.98) < 1e-3
+    at = place.local.map_from_local(found[known])
+    assert np.abs(bilinear(window.dsm, window.dsm_grid.px_from_map(at[:, :2])) - at[:, 2]).max() < 1e-3
+
+
+def test_surface_points_do_not_miss_a_fence() -> None:
+    """One cell thick, 5 m high, and seen at a slant: rays pass it within a fraction of the way to the ground."""
+
+    def fence(east: FloatArray, north: FloatArray) -> FloatArray:
+        return np.where(np.abs(north - 13.0) <= 0.4, GROUND_M + 5.0, GROUND_M) + 0.0 * east
+
+    place = Place(fence, reach_m=150.0, dop_m=1.0)
+    window = place.window
+    view = drawn(place, place.pose(tilt_deg=55.0, heading_deg=0.0, north_m=-30.0), CAMERA, window)
+    px = every_px(CAMERA, 2)
+    truth = cast(place, view, px, window.dsm, window.dsm_grid)
+    on_it = truth[:, 2] > GROUND_M + 0.5
+    assert on_it.sum() > 500
+    every = surface_points(terrain_of(window, place.local), CAMERA, view.local_from_camera)
+    found = every[px[:, 1].astype(int), px[:, 0].astype(int)]
+    assert (np.linalg.norm(found[on_it] - truth[on_it], axis=1) < 0.05).mean() > 0.98
+
+
+def test_surface_points_are_none_where_nothing_is_known() -> None:
+    place = Place(level, reach_m=60.0)
+    window = place.window
+    window.dsm[100:140, 100:140] = np.nan
+    pose = place.pose(height_m=60.0, tilt_deg=50.0)
+    points = surface_points(terrain_of(window, place.local), CAMERA, pose)
+    known = np.isfinite(points).all(axis=2)
+    assert 0.05 < known.mean() < 0.9
+    at = place.local.map_from_local(points[known])[:, :2]
+    assert np.isfinite(bilinear(window.dsm, window.dsm_grid.px_from_map(at))).all()
+    for height_m in (-3.0, -500.0):
+        below = surface_points(terrain_of(place.window, place.local), CAMERA, place.pose(height_m=height_m))
+        assert np.isnan(below).all()

@@ -49,13 +49,6 @@ TINY = replace(COARSE, width_m=360.0, height_m=340.0)
 COUNT = 12
 
 
-def of_kind(kind: Kind) -> CrossDomain:
-    """``SMALL`` in another kind, without making its place anew."""
-    domain = replace(SMALL, kind=kind)
-    vars(domain)["place"] = SMALL.place
-    return domain
-
-
 def rng(seed: int) -> np.random.Generator:
     return np.random.default_rng(seed)
 
@@ -226,7 +219,7 @@ def test_kinds_share_place_map_and_poses() -> None:
 
 
 def test_same_shows_the_world_of_the_map(surveyed: Scene) -> None:
-    flight = of_kind(Kind.SAME).flight_scene()
+    flight = SMALL.of_kind(Kind.SAME).flight_scene()
     np.testing.assert_array_equal(surveyed.texture, flight.texture)
     np.testing.assert_array_equal(surveyed.surface, flight.surface)
 
@@ -264,7 +257,7 @@ def test_xdopdsm_builds_tears_down_and_grows() -> None:
 
 def test_old_dsm_is_smooth_and_noisy_and_the_others_are_not(surveyed: Scene) -> None:
     scene = surveyed
-    layers = {kind: of_kind(kind).layers(scene, scene.surface) for kind in Kind}
+    layers = {kind: SMALL.of_kind(kind).layers(scene, scene.surface) for kind in Kind}
     np.testing.assert_array_equal(layers[Kind.SAME].dsm, layers[Kind.XDOP].dsm)
     for kind in (Kind.XDOP, Kind.XDOPDSM):
         np.testing.assert_array_equal(layers[kind].dop, layers[Kind.SAME].dop)
@@ -369,7 +362,7 @@ def test_written_set_is_read_as_a_flight_with_its_map(written: Path, tmp_path: P
 
 def test_photo_of_the_map_s_own_time_fits_the_map_to_the_pixel(tmp_path: Path) -> None:
     """End to end through the files: the map drawn from the true pose against the photo, quarter by quarter."""
-    same = of_kind(Kind.SAME)
+    same = SMALL.of_kind(Kind.SAME)
     write_set(tmp_path, same, 6)
     shifts = []
     window = cv2.createHanningWindow((WIDTH_PX // 2, HEIGHT_PX // 2), cv2.CV_32F)
