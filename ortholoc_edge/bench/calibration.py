@@ -14,6 +14,7 @@ from ortholoc_edge.adapters.camera import read_image
 from ortholoc_edge.bench import sequence
 from ortholoc_edge.bench.replay import paper_region
 from ortholoc_edge.bench.runner import sample_store, true_ground
+from ortholoc_edge.bench.samples import read_sample
 from ortholoc_edge.errors import ConfigError
 from ortholoc_edge.geometry.arrays import ImageArray
 from ortholoc_edge.geometry.camera import Camera
@@ -85,7 +86,7 @@ def flight_photos(recorded: Sequence[sequence.RecordedFrame], store: MapStore, s
 def sample_photos(paths: Sequence[Path], store: MapStore | None) -> Iterator[Photo]:
     """Those of samples, each with its own map or all with a given one."""
     for path in paths:
-        sample = sequence.read_sample(path)
+        sample = read_sample(path)
         with sample_store(sample) if store is None else nullcontext(store) as own:
             yield Photo(sample.name, sample.image, own, sample.grid.bounds, sample.map_from_camera, sample.camera)
 

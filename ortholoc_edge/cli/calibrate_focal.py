@@ -17,6 +17,7 @@ from tqdm import tqdm
 from ortholoc_edge.bench import calibration as photos
 from ortholoc_edge.bench import sequence
 from ortholoc_edge.bench.calibration import KnownBeside, MatchedPhoto, Photo
+from ortholoc_edge.bench.samples import sample_paths
 from ortholoc_edge.cli import matcher_options
 from ortholoc_edge.cli.arguments import positive, seed, triple, within, writable_folder
 from ortholoc_edge.cli.localize import MAX_UNAIDED_SIDE_M
@@ -130,10 +131,10 @@ def _photos(args: argparse.Namespace, stack: ExitStack) -> tuple[Iterator[Photo]
     if missing:
         raise DatasetError(f"{missing[0]}: no such file or folder")
     store = None if args.pack is None else stack.enter_context(MapStore(Pack.open(args.pack)))
-    samples = [path for source in args.source for path in sequence.sample_paths(source)]
+    samples = [path for source in args.source for path in sample_paths(source)]
     folders = [source for source in args.source if source.is_dir()]
     if samples:
-        if any(not sequence.sample_paths(source) for source in args.source):
+        if any(not sample_paths(source) for source in args.source):
             raise ConfigError("samples and other sources together: calibrate one camera at a time")
         return photos.sample_photos(samples, store), len(samples)
     if folders:
