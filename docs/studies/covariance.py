@@ -1,7 +1,7 @@
 """Errors of fixes against what they say of themselves, by how rough the surface is and how much of the view agrees.
 
-    ortholoc-edge sim --scenario gnss_lost_changed --seeds 3 --packs PACKS --out OUT
-    python docs/studies/covariance.py OUT/gnss_lost_changed PACKS/*
+    ortholoc-edge sim --scenario gnss_lost_changed --seeds 20 --packs PACKS --out OUT
+    python docs/studies/covariance.py OUT/gnss_lost_changed PACKS/PACK
 
 See covariance.md.
 """

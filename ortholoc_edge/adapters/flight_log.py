@@ -20,6 +20,7 @@ import datetime
 import json
 import logging
 import os
+import platform
 import queue
 import threading
 from collections.abc import Mapping
@@ -42,6 +43,7 @@ from ortholoc_edge.pipeline.frame import Frame, VehicleState
 from ortholoc_edge.pipeline.navigator import Circumstances
 from ortholoc_edge.pipeline.outcome import Fix, Outcome
 from ortholoc_edge.pipeline.record import FrameRecord, frame_record, outcome_record
+from ortholoc_edge.pose import pnp
 from ortholoc_edge.tiles.georeference import Georeference
 
 logger = logging.getLogger(__name__)
@@ -50,7 +52,7 @@ HEADER_NAME = "ortholoc"
 FRAME_TOPIC, CAMERA_TOPIC = "/ortholoc/frame", "/camera"
 _S = 1_000_000_000
 
-# Frames are of megabytes, and a disk that hangs must not fill the memory.
+# Grey frames are of a megabyte or two, and a disk that hangs must not fill the memory.
 _QUEUE_LENGTH = 12
 _CLOSE_WAIT_S = 5.0
 _SYNC_EVERY_NS = 1 * _S
@@ -59,10 +61,11 @@ _AGAIN_AFTER_NS = 1 * _S
 # A chunk ends with the message that takes it beyond this, which is what can be read after a power cut. The record of a
 # frame, its last message, and a second's counters are longer by their names alone.
 _CHUNK_BYTES = 256
-# Of the limit; so much is lost at once when the oldest file goes.
+# A file is no longer than this part of the limit, which is lost at once when the oldest goes; nor than so many bytes,
+# since the writer keeps an index of its chunks, half a kilobyte each.
 _FILES_OF_LIMIT = 8
+_MOST_FILE_BYTES = 16 << 20
 _THUMBNAIL_PX, _THUMBNAIL_QUALITY = 320, 70
-_ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 
@@ -86,7 +89,8 @@ class LogHeader(Struct, frozen=True, kw_only=True):
 
     Attributes:
         version: of this program. libraries: that poses depend on.
-        session: the same in all files of one life of the daemon; part: their number, from 0.
+        session: the same in all files of one life of the daemon, "NUMBER-DATE": numbers rise in a folder, while the
+            date is wrong where the clock was never set. part: the number of the file, from 0.
         config: the daemon's `Config` as JSON, where Infinity is allowed.
         pack, pack_sha256: folder, and hash of the manifest, which has those of all files.
         matcher, model_sha256: that were used.
@@ -111,17 +115,16 @@ LoggedStep = tuple[Outcome, VehicleState, Circumstances]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Entry:
-    """A frame on its way to the disk; ``place`` is latitude, longitude (deg) and height above the ellipsoid (m)."""
+    """A frame on its way to the disk; ``picture`` is what is kept of it: grey, or small, or nothing."""
 
-    frame: Frame | None
+    name: str
+    picture: ImageArray | None
     outcome: Outcome
     step: LoggedStep | None
-    sequence: int
-    place: tuple[float, float, float] | None
 
 
 class FlightLog:
-    """Writes ``FOLDER/flight-DATE-PART.mcap``.
+    """Writes ``FOLDER/flight-NUMBER-DATE-PART.mcap``.
 
     What can't be written (a full disk, a slow card) is dropped and counted: logging must not end a flight.
 
@@ -147,6 +150,7 @@ class FlightLog:
         assert options.folder is not None
         self._folder, self._frames = Path(options.folder), options.frames
         self._limit_bytes = options.max_mb * 2**20
+        self._file_bytes = min(self._limit_bytes // _FILES_OF_LIMIT, _MOST_FILE_BYTES)
         self._georeference = georeference
         self._offset_ns = unix_minus_stamp_ns
         self._header = header
@@ -154,10 +158,9 @@ class FlightLog:
         self._part = 0
         self._failing = False
         self._failed_ns = 0
-        self._sequence = 0
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            self._session = self._free_session(started_ns + unix_minus_stamp_ns)
+            self._session = self._next_session(started_ns + unix_minus_stamp_ns)
             self._file: _File | None = self._open()
         except OSError as err:
             raise OrtholocError(f"{self._folder}: can't write the log there ({err}); see log.folder") from err
@@ -178,8 +181,8 @@ class FlightLog:
             outcome: as published.
             step: None where it was not localized.
         """
-        self._hand_over(_Entry(frame, outcome, step, self._sequence, self._place(outcome)))
-        self._sequence += step is not None
+        name, picture = ("", None) if frame is None else (frame.name, self._kept(frame.image))
+        self._hand_over(_Entry(name, picture, outcome, step))
 
     def note(self, stamp_ns: int, statistics: Mapping[str, Any]) -> None:
         """Hand over the counters; returns at once."""
@@ -191,12 +194,18 @@ class FlightLog:
         except queue.Full:
             self.dropped += isinstance(entry, _Entry)
 
-    def _place(self, outcome: Outcome) -> tuple[float, float, float] | None:
-        if not isinstance(outcome, Fix):
+    def _kept(self, image: ImageArray) -> ImageArray | None:
+        """What is kept of a frame; None where nothing is wanted, or it is no picture: then it was refused, too."""
+        if self._frames == "none" or image.dtype != np.uint8 or image.ndim not in (2, 3) or not image.size:
             return None
-        place = self._georeference.geodetic_from_map(outcome.map_from_camera.translation)
-        height_m = place.height_ellipsoid_m if place.height_ellipsoid_m is not None else place.height_amsl_m
-        return place.lat_deg, place.lon_deg, float("nan") if height_m is None else height_m
+        try:
+            if self._frames == "all":
+                # Every matcher begins so; the rest of a colour image tells a replay nothing.
+                return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
+            scale = min(1.0, _THUMBNAIL_PX / max(image.shape[:2]))
+            return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+        except cv2.error:
+            return None
 
     def close(self) -> None:
         """Write what waits and end the thread; a disk that is full or hangs ends neither in an error nor in a wait
@@ -252,7 +261,7 @@ class FlightLog:
             stamp_ns, counters = entry
             self._file.add("health", stamp_ns + self._offset_ns, counters)
         self._file.flush(_stamp_ns(entry))
-        if self._file.size() >= self._limit_bytes // _FILES_OF_LIMIT:
+        if self._file.size() >= self._file_bytes:
             whole, self._file = self._file, None
             whole.finish()
             self._file = self._open()
@@ -261,49 +270,30 @@ class FlightLog:
         outcome = entry.outcome
         unix_ns = outcome.stamp_ns + self._offset_ns
         file.add("outcome", unix_ns, msgspec.json.encode(outcome_record(outcome)))
-        if isinstance(outcome, Fix) and entry.place is not None:
-            file.add("fix", unix_ns, self._location(outcome, entry.place, unix_ns))
+        if isinstance(outcome, Fix):
+            file.add("fix", unix_ns, self._location(outcome, unix_ns))
             file.add("pose", unix_ns, self._pose(outcome, unix_ns))
-        image = None if entry.frame is None else self._encoded(entry.frame.image)
-        if image is not None:
-            form, data = image
-            file.add("camera", unix_ns, _image_message(form, data, unix_ns))
+        whole = self._frames == "all" and entry.picture is not None
+        if entry.picture is not None:
+            file.add("camera", unix_ns, _image_message(entry.picture, whole, unix_ns))
         if entry.step is not None:
-            name = "" if entry.frame is None else entry.frame.name
-            whole = image is not None and image[0] == "png"
-            file.add("frame", unix_ns, msgspec.json.encode(frame_record(entry.sequence, name, whole, *entry.step)))
+            file.add("frame", unix_ns, msgspec.json.encode(frame_record(entry.name, whole, *entry.step)))
 
-    def _encoded(self, image: ImageArray) -> tuple[str, bytes] | None:
-        """None where none is wanted, or it is no picture: then it was refused, too."""
-        if self._frames == "none" or image.dtype != np.uint8 or image.ndim not in (2, 3) or not image.size:
-            return None
-        try:
-            if self._frames == "all":
-                # Every matcher begins so; the rest of a colour image tells a replay nothing.
-                grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-                return "png", cv2.imencode(".png", grey, _FAST_PNG)[1].tobytes()
-            scale = min(1.0, _THUMBNAIL_PX / max(image.shape[:2]))
-            small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-            if small.ndim == 3:
-                small = cv2.cvtColor(small, cv2.COLOR_RGB2BGR)
-            return "jpeg", cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _THUMBNAIL_QUALITY])[1].tobytes()
-        except cv2.error:
-            return None
-
-    def _location(self, fix: Fix, place: tuple[float, float, float], unix_ns: int) -> bytes:
+    def _location(self, fix: Fix, unix_ns: int) -> bytes:
+        place = self._georeference.geodetic_from_map(fix.map_from_camera.translation)
         ned_from_map = frames.map_from_ned_rotation(
             self._georeference.convergence_rad(fix.map_from_camera.translation[:2])
         ).T
         ned = cov.rotated(fix.covariance, ned_from_map)[:3, :3]
         # Foxglove wants east, north, up.
-        enu = _ENU_FROM_NED @ ned @ _ENU_FROM_NED.T
+        enu = frames.ENU_FROM_NED @ ned @ frames.ENU_FROM_NED.T
         return msgspec.json.encode(
             {
                 "timestamp": _time(unix_ns),
                 "frame_id": "camera",
-                "latitude": place[0],
-                "longitude": place[1],
-                "altitude": place[2],
+                "latitude": place.lat_deg,
+                "longitude": place.lon_deg,
+                "altitude": place.height_amsl_m if place.height_ellipsoid_m is None else place.height_ellipsoid_m,
                 "position_covariance": enu.ravel().tolist(),
                 "position_covariance_type": 3,
             }
@@ -325,20 +315,16 @@ class FlightLog:
 
     # -- files -----------------------------------------------------------------------------------------
 
-    def _free_session(self, unix_ns: int) -> str:
-        """By date, and by number where the clock was never set or the daemon restarts at once."""
+    def _next_session(self, unix_ns: int) -> str:
+        numbers = [int(path.name.split("-")[1]) for path in self._folder.glob("flight-[0-9]*-*.mcap")]
         date = datetime.datetime.fromtimestamp(unix_ns // _S, datetime.UTC).strftime("%Y%m%dT%H%M%SZ")
-        for number in range(10_000):
-            session = f"{date}-{number}" if number else date
-            if not any(self._folder.glob(f"flight-{session}-*.mcap")):
-                return session
-        raise OSError(f"10000 logs of {date}")
+        return f"{max(numbers, default=0) + 1:05d}-{date}"
 
     def _open(self) -> _File:
         self._make_room()
         header = LogHeader(
             version=__version__,
-            libraries={"numpy": np.__version__, "opencv": cv2.__version__},
+            libraries=libraries(),
             session=self._session,
             part=self._part,
             unix_minus_stamp_ns=self._offset_ns,
@@ -353,11 +339,11 @@ class FlightLog:
         logs = []
         for path in self._folder.glob("flight-*.mcap"):
             with contextlib.suppress(OSError):
-                status = path.stat()
-                logs.append((status.st_mtime_ns, path.name, status.st_size, path))
-        allowed = self._limit_bytes - self._limit_bytes // _FILES_OF_LIMIT
-        total = sum(size for _, _, size, _ in logs)
-        for _, _, size, path in sorted(logs, key=lambda log: log[:2]):
+                logs.append((path.name, path.stat().st_size, path))
+        allowed = self._limit_bytes - self._file_bytes
+        total = sum(size for _, size, _ in logs)
+        # By name, and so by number: the parts of this life last.
+        for _, size, path in sorted(logs):
             if total <= allowed:
                 return
             with contextlib.suppress(OSError):
@@ -382,8 +368,9 @@ class _File:
             for name, (topic, schema, definition) in _CHANNELS.items():
                 number = self._writer.register_schema(schema, "jsonschema", json.dumps(definition).encode())
                 self._channels[name] = self._writer.register_channel(topic, "json", number)
-            # A full disk is told here, and leaves no file behind for each try.
+            # A full disk is told here, and leaves no file behind for each try. What a power cut leaves has its header.
             self._stream.flush()
+            os.fsync(self._stream.fileno())
         except OSError:
             self.abandon()
             path.unlink(missing_ok=True)
@@ -416,6 +403,11 @@ class _File:
             self._stream.close()
 
 
+def libraries() -> dict[str, str]:
+    """Versions that poses depend on in their last bits."""
+    return {"numpy": np.__version__, "opencv": cv2.__version__, "solver": pnp.SOLVER, "processor": platform.machine()}
+
+
 def header_of(metadata: Mapping[str, str]) -> LogHeader:
     """Raises: msgspec.ValidationError, msgspec.DecodeError."""
     return msgspec.convert({key: msgspec.json.decode(value) for key, value in metadata.items()}, LogHeader)
@@ -433,12 +425,17 @@ def _time(unix_ns: int) -> dict[str, int]:
     return {"sec": unix_ns // _S, "nsec": unix_ns % _S}
 
 
-def _image_message(form: str, data: bytes, unix_ns: int) -> bytes:
+def _image_message(picture: ImageArray, whole: bool, unix_ns: int) -> bytes:
+    if whole:
+        form, data = "png", cv2.imencode(".png", picture, _FAST_PNG)[1]
+    else:
+        drawn = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+        form, data = "jpeg", cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, _THUMBNAIL_QUALITY])[1]
     return msgspec.json.encode(
         {
             "timestamp": _time(unix_ns),
             "frame_id": "camera",
-            "data": base64.b64encode(data).decode(),
+            "data": base64.b64encode(data.tobytes()).decode(),
             "format": form,
         }
     )

@@ -56,11 +56,17 @@ def log_files(source: Path) -> list[Path]:
         return [source]
     if not source.is_dir():
         return []
-    found = [(path, read_header(path)) for path in sorted(source.glob("flight-*.mcap"))]
-    if not found:
-        return []
-    last = max((header.session for _, header in found), key=_session_order)
-    return [path for path, header in sorted(found, key=lambda pair: pair[1].part) if header.session == last]
+    found: list[tuple[int, Path, str]] = []
+    for path in source.glob("flight-*.mcap"):
+        try:
+            header = read_header(path)
+        except DatasetError as err:
+            # A power cut, or a full disk, in the moment that it was begun.
+            logger.warning("%s; left out", err)
+            continue
+        found.append((header.part, path, header.session))
+    last = max((session for _, _, session in found), default="")
+    return [path for _, path, session in sorted(found) if session == last]
 
 
 def read_header(path: Path) -> LogHeader:
@@ -125,11 +131,6 @@ def _image(message: bytes) -> ImageArray | None:
     return None if image is None else np.asarray(image, dtype=np.uint8)
 
 
-def _session_order(session: str) -> tuple[str, int]:
-    date, _, number = session.partition("-")
-    return date, int(number or 0)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Repeated:
     """A step taken again.
@@ -162,7 +163,8 @@ class Comparison(Struct, frozen=True, kw_only=True):
     """A log flown again; the object that ``replay LOG --json`` prints.
 
     Attributes:
-        files: in order. version: of the program that wrote them.
+        files: in order. version: of the program that wrote them; other_libraries: of what poses depend on, and is
+            another here.
         steps: in the log. pictures: of these, with one without loss. left_out: that were not repeated, for want of it.
         repeated: taken again; alone: of these, from the recorded prediction, for steps before them are missing.
         fixes: of those repeated, in flight. same: came to the same in every bit.
@@ -173,6 +175,7 @@ class Comparison(Struct, frozen=True, kw_only=True):
 
     files: list[str]
     version: str
+    other_libraries: dict[str, str]
     steps: int
     pictures: int
     left_out: int
@@ -194,7 +197,7 @@ def repeat(logged: Iterable[LoggedFrame], navigator: Navigator) -> Iterator[Repe
     expected = 0
     for one in logged:
         record, was = one.record, one.record.circumstances()
-        complete = expected == record.sequence
+        complete = expected == record.number
         # Without a prediction the picture was not looked at.
         image = one.image if one.image is not None else np.zeros((0, 0), np.uint8) if was.prior is None else None
         now: Outcome | None = None
@@ -213,7 +216,9 @@ def repeat(logged: Iterable[LoggedFrame], navigator: Navigator) -> Iterator[Repe
             )
 
 
-def compare(files: list[Path], version: str, repeated: Iterable[Repeated | None]) -> Comparison:
+def compare(
+    files: list[Path], version: str, other_libraries: dict[str, str], repeated: Iterable[Repeated | None]
+) -> Comparison:
     """Sum up."""
     every = list(repeated)
     taken = [one for one in every if one is not None]
@@ -221,6 +226,7 @@ def compare(files: list[Path], version: str, repeated: Iterable[Repeated | None]
     return Comparison(
         files=[str(path) for path in files],
         version=version,
+        other_libraries=other_libraries,
         steps=len(every),
         pictures=sum(one.picture for one in taken),
         left_out=len(every) - len(taken),

@@ -98,7 +98,7 @@ def comparison_table(c: Comparison) -> str:
     """A flight log flown again, for people."""
     rows = [
         ("log", f"{c.files[0]}" + (f" and {len(c.files) - 1} more" if len(c.files) > 1 else "")),
-        ("written by", f"ortholoc-edge {c.version}"),
+        ("written by", " and ".join([f"ortholoc-edge {c.version}", *map(" ".join, c.other_libraries.items())])),
         ("steps", f"{c.steps}, of which repeated {c.repeated} ({c.alone} from the recorded prediction)"),
         ("fixes", f"{c.fixes} in flight"),
         ("the same", f"{c.same} in every bit"),

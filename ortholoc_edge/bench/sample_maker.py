@@ -140,10 +140,10 @@ class PackScenery:
                 # The picture is not looked at: the coarsest will do.
                 window = self._truth.read(bounds, self._truth.dop_grids[-1].gsd_m, gsd_m)
                 return None if window is None else Terrain.of(window, local)
-            except WindowTooLargeError:
+            except WindowTooLargeError as err:
                 gsd_m *= 2.0
                 if gsd_m > _COARSEST * finest_m:
-                    raise
+                    raise DatasetError(f"the view is too wide for its height: {err}") from err
 
 
 def _bounds(points: FloatArray) -> Bounds:

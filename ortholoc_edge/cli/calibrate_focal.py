@@ -72,7 +72,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         type=positive,
         default=math.inf,
         metavar="M",
-        help="take the recorded heights as a barometer's with this 1-sigma, their errors drawn",
+        help="take the recorded heights as a barometer's with this 1-sigma, their errors drawn for each photo by "
+        "itself (a real barometer's are alike through a flight)",
     )
     parser.add_argument(
         "--tilt-sigma-deg",

@@ -13,6 +13,7 @@ import msgspec
 from tqdm import tqdm
 
 from ortholoc_edge import __version__
+from ortholoc_edge.adapters.flight_log import libraries
 from ortholoc_edge.bench import report, sequence
 from ortholoc_edge.bench.draw import write_png
 from ortholoc_edge.bench.flight_log import compare, log_files, read_frames, read_header, repeat
@@ -36,9 +37,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="localize a recorded sequence and compare with its true poses, or fly a flight log again",
         description="Feeds a recorded sequence through the pipeline that flies and compares with the true poses. "
         "SEQUENCE is a folder of photos with a *_flight.csv, an OrthoLoC sample (.npz) or a folder of samples. Of a "
-        "flight log (.mcap, or a folder of them: the last flight there), which has no true poses, each outcome is "
-        "compared with that of the flight; pack and settings are the log's, of the options only --pack, --json and "
-        "--out go with it, and the exit code is 1 if anything came out differently.",
+        "flight log (.mcap, or a folder of them: what the daemon wrote there since it was last started), which has no "
+        "true poses, each outcome is compared with that of the flight; pack and settings are the log's, of the options "
+        "only --pack, --json and --out go with it, and the exit code is 1 if anything came out differently.",
     )
     parser.add_argument("sequence", type=Path, metavar="SEQUENCE")
     parser.add_argument(
@@ -119,13 +120,19 @@ def _fly_again(logs: list[Path], args: argparse.Namespace) -> int:
             raise DatasetError(
                 f"{pack}: not the pack that was flown with, its manifest differs; name that one with --pack"
             )
+        if matcher.model_sha256 != header.model_sha256:
+            raise DatasetError(
+                f"{logs[0]}: flown with the model {header.model_sha256}, here is {matcher.model_sha256}; name that one "
+                "in the configuration, or build it with the version that flew"
+            )
         navigator = make_navigator(config, store, matcher, 0, None)
         try:
             steps = chain.from_iterable(map(read_frames, logs))
             found = list(tqdm(repeat(steps, navigator), desc=args.sequence.name, unit="frame"))
         finally:
             navigator.localizer.close()
-    comparison = compare(logs, header.version, found)
+    others = {name: was for name, was in header.libraries.items() if libraries().get(name) != was}
+    comparison = compare(logs, header.version, others, found)
     if not comparison.pictures:
         raise DatasetError(
             f"{args.sequence}: {len(found)} frames, none with a picture without loss; such logs are written with "

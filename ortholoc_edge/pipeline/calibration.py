@@ -13,9 +13,6 @@ from ortholoc_edge.pipeline.outcome import Reason
 from ortholoc_edge.pose import calibrate, pnp
 from ortholoc_edge.pose.calibrate import Calibration, Unknowns, View
 
-# Leaving a photo out changes what the others agree on, so that another may have to go.
-_MOST_ROUNDS = 4
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibrated:
@@ -68,7 +65,8 @@ def calibrate_photos(
     """
     dropped: dict[str, gate.Refusal] = {}
     names: Sequence[str] = tuple(views)
-    for _ in range(_MOST_ROUNDS):
+    # Leaving a photo out changes what the others agree on; another may have to go. Each takes one at least.
+    while True:
         found = calibrate.solve([views[name] for name in names], camera, unknowns, seed=seed) if names else None
         if found is None:
             dropped |= {name: _no_pose(views[name], limits) for name in names}

@@ -56,6 +56,8 @@ _GROUND_GSD_M = 4.0
 # A map picture finer than the frame is no use; a coarser one than this is hard to match (field-notes, scale).
 _MAX_COARSENING = 3.0
 _UNSTATED_SIGMA_PX = 0.5
+# Of one frame the principal point can't be told from the tilt; `calibrate-focal` has many.
+_ONLY_FOCAL = calibrate.Unknowns(principal_point_sigma=0.0)
 # Part of the gate's least number and ratio of inliers that a round with stored features needs before the last, which
 # must have them all; and if the round before had not, so many times their number. Around poses 60 m wrong the last
 # found up to 19 that agree, around right ones of 27 to 41 inliers 127 to 233 (seneca).
@@ -335,10 +337,10 @@ class Localizer:
             unsettled_m = surface.unsettled_m(
                 scene.window.dsm, scene.window.dsm_grid, fix.points_map, found.support
             )
-            covariance = fix.covariance + surface.unsettled_covariance(
-                unsettled_m, fix.points_map, fix.map_from_camera.translation
-            )
-        return replace(fix, quality=found.support, covariance=covariance)
+            ground = surface.unsettled_covariance(unsettled_m, fix.points_map, fix.map_from_camera.translation)
+        return replace(
+            fix, quality=found.support, covariance=fix.covariance + ground, ground_covariance=ground
+        )
 
     def _refined(
         self,
@@ -434,7 +436,7 @@ class Localizer:
         if frame.image.dtype != np.uint8 or shape not in (size, (*size, 3)):
             raise RejectedError(
                 Reason.BAD_FRAME,
-                f"{frame.name}: {shape} {frame.image.dtype}, but the camera's intrinsics are for "
+                f"{frame.name}: {shape[:2]} {frame.image.dtype}, but the camera's intrinsics are for "
                 f"{camera.width} x {camera.height} px of 8 bit",
             )
         if frame.image.ndim == 2:
@@ -756,7 +758,7 @@ class Localizer:
 
     def _pose(self, points_local: FloatArray, query_px: FloatArray) -> pnp.PoseEstimate | None:
         if self._options.calibrate:
-            found = calibrate.solve([calibrate.View(points_local, query_px)], self.camera.pinhole())
+            found = calibrate.solve([calibrate.View(points_local, query_px)], self.camera.pinhole(), _ONLY_FOCAL)
             estimate = None if found is None else found.views[0]
             # The pixels are those without distortion, which stays as it was configured.
             return estimate and replace(estimate, camera=replace(estimate.camera, distortion=self.camera.distortion))

@@ -34,12 +34,14 @@ class Circumstances:
     """What a step depended on besides its frame, its state and the steps before: with these it can be taken again.
 
     Attributes:
+        number: of the step since the start, from 0; one that failed has used up its own.
         prior: the prediction; None where there was none.
         rung: of detail.
         proceeded: how often it was told to go on before it was told to stop, or did not ask any more.
         reset_counter: the tracker's before the step; others may raise it between steps.
     """
 
+    number: int
     prior: PosePrior | None
     rung: int
     proceeded: int
@@ -65,6 +67,7 @@ class Navigator:
         self.tracker = tracker
         self.ladder = Ladder(localizer.rungs, budget_ms)
         self.last: Circumstances | None = None
+        self._steps = 0
 
     @property
     def prior(self) -> PosePrior | None:
@@ -86,7 +89,8 @@ class Navigator:
         return self._step(frame, state, _yes(was.proceeded), was.rung)
 
     def _step(self, frame: Frame, state: VehicleState, proceed: Callable[[], bool], rung: int) -> Outcome:
-        reset_counter, proceeded = self.tracker.reset_counter, 0
+        number, reset_counter, proceeded = self._steps, self.tracker.reset_counter, 0
+        self._steps += 1
 
         def counted() -> bool:
             nonlocal proceeded
@@ -100,7 +104,7 @@ class Navigator:
             prior, outcome = None, predicted
         else:
             prior, outcome = predicted, self.localizer.localize(frame, predicted, counted, rung)
-        self.last = Circumstances(prior, rung, proceeded, reset_counter)
+        self.last = Circumstances(number, prior, rung, proceeded, reset_counter)
         self.tracker.update(outcome, state)
         return outcome
 

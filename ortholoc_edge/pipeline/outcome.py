@@ -59,6 +59,9 @@ class Fix:
         focal_sigma_px: 1-sigma of a calibrated focal length; None if it was given.
         covariance: (6, 6); position in map axes (m), then rotation vector in map axes (rad):
             ``R_true = exp(d) @ R_estimated``. Of structural matching the autopilot's attitude is in it, with its sigma.
+        ground_covariance: (6, 6), the part of ``covariance`` that is of ground which the view does not agree with
+            (`surface.unsettled_covariance`); None where nothing was added. It is there for whoever uses the fix; what
+            judges others by the fix, GNSS above all, must not be led by it to trust them more.
         quality: 0..1, the inlier ratio of a round whose pairs were not picked by a pose; of structural matching the
             part of the patches in view that agree. For displays and for MAVLink's quality field.
         matches, inliers: counts of the round that gave the pose.
@@ -83,6 +86,7 @@ class Fix:
     focal_sigma_px: float | None = None
     timings_ms: dict[str, float] = field(default_factory=dict)
     stored_features: bool = False
+    ground_covariance: FloatArray | None = None
 
     @property
     def protection_m(self) -> tuple[float, float]:

@@ -55,13 +55,13 @@ class FrameRecord(Struct, frozen=True, kw_only=True):
     not finite.
 
     Attributes:
-        sequence: of the steps of one life of the daemon, from 0.
+        number: `Circumstances.number`.
         whole: whether the picture beside it is without loss.
         mount: the gimbal's ``body_from_camera`` as (3, 4) and its sigmas; None of a fixed one.
         outcome: `outcome_record`, before its age was looked at.
     """
 
-    sequence: int
+    number: int
     name: str
     stamp_ns: int
     whole: bool
@@ -99,16 +99,16 @@ class FrameRecord(Struct, frozen=True, kw_only=True):
         prior = None
         if self.prior_map_from_camera is not None and self.prior_covariance is not None:
             prior = PosePrior(_rigid(self.prior_map_from_camera), _floats(self.prior_covariance))
-        return Circumstances(prior, self.rung, self.proceeded, self.reset_counter)
+        return Circumstances(self.number, prior, self.rung, self.proceeded, self.reset_counter)
 
 
 def frame_record(
-    sequence: int, name: str, whole: bool, outcome: Outcome, state: VehicleState, circumstances: Circumstances
+    name: str, whole: bool, outcome: Outcome, state: VehicleState, circumstances: Circumstances
 ) -> FrameRecord:
     """What `Navigator.step_again` needs."""
     prior, mount = circumstances.prior, state.mount
     return FrameRecord(
-        sequence=sequence,
+        number=circumstances.number,
         name=name,
         stamp_ns=state.stamp_ns,
         whole=whole,

@@ -63,11 +63,16 @@ class TrackerStatus(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Anchor:
-    """Where the body was at the last fix (or the last trusted GNSS position), and what the odometry said then."""
+    """Where the body was at the last fix (or the last trusted GNSS position), and what the odometry said then.
+
+    ``settled`` is the covariance without the fix's `Fix.ground_covariance`: GNSS is judged by that. Over a wood it
+    would else pass for the surer of the two, and take the place of the chain of fixes that contradicts it.
+    """
 
     stamp_ns: int
     position_map_m: FloatArray
     covariance: FloatArray
+    settled: FloatArray
     odometry_ned_m: FloatArray | None
     odometry_epoch: int
     from_fix: bool
@@ -101,6 +106,7 @@ class Tracker:
         self._options = options
         self._anchor: _Anchor | None = None
         self._last_prior: PosePrior | None = None
+        self._gnss_turn = False
         self.status = TrackerStatus.SEARCH
         self.reset_counter = first_reset_counter % 256
 
@@ -123,7 +129,7 @@ class Tracker:
                 "no attitude of the gimbal near the exposure; is it on, and does [mount] name the right one?",
             )
         carried = self._carried(state)
-        if carried is None or _sigma(carried[1]) > self._options.lost_sigma_m:
+        if carried is None or _sigma(carried[1]) > self._options.lost_sigma_m or self._contested(carried, state):
             believed = self._believed(state)
             if believed is not None:
                 # The chain of fixes is broken: the next one is a new start, and the autopilot must hear of it as one.
@@ -168,10 +174,12 @@ class Tracker:
         assert mount is not None, "predict() refuses a state without"
         body = outcome.map_from_camera @ mount.body_from_camera.inverse()
         lever = body.translation - outcome.map_from_camera.translation
+        ground = outcome.ground_covariance
         covariance = cov.of_moved_point(outcome.covariance, lever)
-        self._anchor = _anchor(state, body.translation, covariance[:3, :3], from_fix=True)
+        settled = covariance if ground is None else cov.of_moved_point(outcome.covariance - ground, lever)
+        self._anchor = _anchor(state, body.translation, covariance[:3, :3], settled[:3, :3], from_fix=True)
         if state.position_map_m is not None:
-            both = covariance[:2, :2] + np.eye(2) * state.position_sigma_m[0] ** 2
+            both = settled[:2, :2] + np.eye(2) * state.position_sigma_m[0] ** 2
             self.witness.compare(state.stamp_ns, state.position_map_m - body.translation, both)
         self.status = TrackerStatus.TRACK
 
@@ -225,6 +233,21 @@ class Tracker:
             return None
         return believed, _axes(*self._options.believed_sigma_m)
 
+    def _contested(self, carried: tuple[FloatArray, FloatArray], state: VehicleState) -> bool:
+        """Whether it is the turn of the autopilot's own position against a GNSS that it contradicts.
+
+        Before the first fix nothing tells which is right: the autopilot may have flown by our fixes of an earlier life
+        while GNSS is spoofed. They take turns; the first fix decides.
+        """
+        believed = self._believed(state)
+        if believed is None or self._anchor is None or self._anchor.from_fix:
+            return False
+        apart = cov.mahalanobis_squared((believed[0] - carried[0])[:2], (believed[1] + carried[1])[:2, :2])
+        if apart <= _CONTRADICTION_SIGMAS**2:
+            return False
+        self._gnss_turn = not self._gnss_turn
+        return not self._gnss_turn
+
     def announce_jump(self) -> None:
         """The next estimate starts anew for the autopilot: its origin moved, or it restarted."""
         self.reset_counter = (self.reset_counter + 1) % 256
@@ -246,18 +269,23 @@ class Tracker:
         covariance = _axes(*sigma_m)
         carried = self._carried(state)
         if carried is not None and self._anchor is not None:
-            if _sigma(carried[1]) <= _sigma(covariance):
+            settled = carried[1] - self._anchor.covariance + self._anchor.settled
+            if _sigma(settled) <= _sigma(covariance):
                 return
-            apart = cov.mahalanobis_squared(position - carried[0], covariance + carried[1])
+            apart = cov.mahalanobis_squared(position - carried[0], covariance + settled)
             if self._anchor.from_fix and apart > _CONTRADICTION_SIGMAS**2:
                 return
-        self._anchor = _anchor(state, position, covariance, from_fix=False)
+        self._anchor = _anchor(state, position, covariance, covariance, from_fix=False)
 
 
-def _anchor(state: VehicleState, position: FloatArray, covariance: FloatArray, from_fix: bool) -> _Anchor:
+def _anchor(
+    state: VehicleState, position: FloatArray, covariance: FloatArray, settled: FloatArray, from_fix: bool
+) -> _Anchor:
     odometry = state.odometry_ned_m
     usable = odometry is not None and bool(np.isfinite(odometry).all())
-    return _Anchor(state.stamp_ns, position, covariance, odometry if usable else None, state.odometry_epoch, from_fix)
+    return _Anchor(
+        state.stamp_ns, position, covariance, settled, odometry if usable else None, state.odometry_epoch, from_fix
+    )
 
 
 def _wandered_s(elapsed_s: float, memory_s: float) -> float:

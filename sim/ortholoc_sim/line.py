@@ -61,9 +61,9 @@ class Wire:
         return max(0, (self._free_ns - now_ns) * self._options.baud // (_BITS_PER_BYTE * _S))
 
     def send(self, frame: bytes, now_ns: int) -> bool:
-        """Hand a frame over, which travels as a whole; False if the buffer has no room for it."""
+        """Hand a frame over, which travels as a whole; False if the buffer of a serial line has no room for it."""
         options = self._options
-        if self.waiting_bytes(now_ns) + len(frame) > _ROOM_BYTES:
+        if self._options.baud and self.waiting_bytes(now_ns) + len(frame) > _ROOM_BYTES:
             self.counts["refused"] += 1
             return False
         leaves_ns = now_ns

@@ -64,8 +64,8 @@ def a_state(stamp_ns: int) -> VehicleState:
     )  # fmt: skip
 
 
-def was(prior: bool = True) -> Circumstances:
-    return Circumstances(PosePrior(Rigid3.identity(), np.eye(6) / 3) if prior else None, 1, 5, 255)
+def was(prior: bool = True, number: int = 0) -> Circumstances:
+    return Circumstances(number, PosePrior(Rigid3.identity(), np.eye(6) / 3) if prior else None, 1, 5, 255)
 
 
 def put(log: FlightLog, stamp_ns: int, image: Any = IMAGE, detail: str = "nothing there") -> None:
@@ -104,7 +104,7 @@ def test_what_foxglove_finds(tmp_path: Path) -> None:
     log.put(None, refused(7 * S))
     log.close()
     (path,) = (tmp_path / "new" / "log").iterdir()
-    assert path.name == "flight-20270101T000000Z-000.mcap"
+    assert path.name == "flight-00001-20270101T000000Z-000.mcap"
     found = {(topic, name): (content, time_ns) for topic, name, content, time_ns in messages(path)}
     image, time_ns = found["/camera", "foxglove.CompressedImage"]
     assert image["timestamp"] == {"sec": NEW_YEAR_NS // S + 5, "nsec": 0}
@@ -138,11 +138,12 @@ def test_covariance_of_the_location_is_east_north_up(tmp_path: Path) -> None:
 def test_a_step_comes_back_as_it_was(tmp_path: Path) -> None:
     log = made(tmp_path)
     put(log, 9 * S)
-    log.put(Frame(10 * S, IMAGE, "ten"), refused(10 * S), (refused(10 * S), a_state(10 * S), was(prior=False)))
+    log.put(Frame(10 * S, IMAGE, "ten"), refused(10 * S), (refused(10 * S), a_state(10 * S), was(False, 4)))
     log.close()
     (path,) = tmp_path.iterdir()
     header = read_header(path)
-    assert (header.pack, header.pack_sha256, header.part, header.session) == ("/packs/one", "ab", 0, "20270101T000000Z")
+    assert (header.pack, header.pack_sha256, header.part) == ("/packs/one", "ab", 0)
+    assert header.session == "00001-20270101T000000Z"
     first, second = read_frames(path)
     assert np.array_equal(first.image, IMAGE)
     state, circumstances = first.record.state(), first.record.circumstances()
@@ -157,7 +158,7 @@ def test_a_step_comes_back_as_it_was(tmp_path: Path) -> None:
     assert np.array_equal(circumstances.prior.covariance, np.eye(6) / 3), "in every bit"
     assert (circumstances.rung, circumstances.proceeded, circumstances.reset_counter) == (1, 5, 255)
     assert second.record.circumstances().prior is None
-    assert [first.record.sequence, second.record.sequence] == [0, 1]
+    assert [first.record.number, second.record.number] == [0, 4]
 
 
 @pytest.mark.parametrize(
@@ -202,10 +203,37 @@ def test_each_life_has_a_file_of_its_own(tmp_path: Path) -> None:
         put(log, start)
         log.close()
     assert [path.name for path in sorted(tmp_path.iterdir())] == [
-        "flight-20270101T000000Z-000.mcap",
-        "flight-20270101T000000Z-1-000.mcap",
+        "flight-00001-20270101T000000Z-000.mcap",
+        "flight-00002-20270101T000000Z-000.mcap",
     ]
     assert [step.record.stamp_ns for path in log_files(tmp_path) for step in read_frames(path)] == [10]
+
+
+def test_what_a_power_cut_left_of_a_beginning_does_not_hide_the_flight(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    log = made(tmp_path)
+    put(log, S)
+    log.close()
+    (tmp_path / "flight-00002-19700101T000000Z-000.mcap").write_bytes(b"")
+    assert [read_header(path).session for path in log_files(tmp_path)] == ["00001-20270101T000000Z"]
+    assert any("00002" in record.message and "left out" in record.message for record in caplog.records)
+
+
+def test_with_a_clock_that_was_never_set_the_parts_of_this_life_go_last(tmp_path: Path) -> None:
+    before = made(tmp_path, max_mb=1)
+    noise = np.random.default_rng(1).integers(0, 255, (180, 240), dtype=np.uint8)
+    for number in range(12):
+        put(before, number * S, noise)
+        wait_for(before._queue.empty)
+    before.close()
+    options = LogOptions(folder=str(tmp_path), max_mb=1, frames="all")
+    now = FlightLog(options, GEOREFERENCE, HEADER, 0, 0)
+    for number in range(14):
+        put(now, number * S, noise)
+        wait_for(now._queue.empty)
+    now.close()
+    assert [step.record.stamp_ns // S for path in log_files(tmp_path) for step in read_frames(path)] == list(range(14))
 
 
 def test_the_oldest_go_and_the_limit_is_kept(tmp_path: Path) -> None:
@@ -300,7 +328,7 @@ def test_full_disk_drops_and_counts_and_recovers(tmp_path: Path, caplog: pytest.
     log = made(tmp_path)
     for number in range(5):
         put(log, number * S)
-    path = tmp_path / "flight-20270101T000000Z-000.mcap"
+    path = tmp_path / "flight-00001-20270101T000000Z-000.mcap"
     wait_for(lambda: log._queue.empty() and len(stamps(tmp_path)) == 5)
     with full_disk(100):
         for number in range(5, 15):
@@ -401,6 +429,7 @@ def test_a_flight_comes_out_the_same_in_every_bit(flown_log: Path, capsys: pytes
     code, found = replayed(flown_log, capsys)
     assert code == 0
     assert found["steps"] == found["repeated"] == found["same"] >= 5
+    assert found["other_libraries"] == {}
     assert 1 <= found["fixes"] < found["steps"], "fixes and refusals"
     assert (found["alone"], found["left_out"], found["furthest_m"]) == (0, 0, 0.0)
 
@@ -415,7 +444,6 @@ def test_from_a_log_whose_beginning_is_gone(
     log = FlightLog(options, GEOREFERENCE, fields, 0, 0)
     steps = list(read_frames(path))
     for step in steps[2:]:
-        log._sequence = step.record.sequence
         outcome = refused(step.record.stamp_ns)
         frame = Frame(step.record.stamp_ns, step.image, step.record.name)
         log.put(frame, outcome, (outcome, step.record.state(), step.record.circumstances()))

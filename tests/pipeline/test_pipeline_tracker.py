@@ -248,6 +248,35 @@ def test_an_autopilot_that_may_have_followed_a_spoofer_says_not_where_to_look():
     assert isinstance(made.predict(believed), Rejected)
 
 
+def test_ground_that_is_not_believed_gives_gnss_no_way_in():
+    """Over a wood a fix says that it may be 2 m off. GNSS 7 m away, surer than that, still contradicts it."""
+    made = tracker()
+    start = state(0, (0, 0, 0), position=(0, 0, 100))
+    made.predict(start)
+    wide = np.zeros((6, 6))
+    wide[:3, :3] = np.eye(3) * 4.0
+    good = fix((0, 0, 100.0))
+    made.update(replace(good, covariance=good.covariance + wide, ground_covariance=wide), start)
+    prior = made.predict(state(0.5, (0, 0, 0), position=(7.0, 0, 100), sigma=(1.5, 2.5)))
+    assert np.allclose(prior.map_from_camera.translation, (0, 0, 100))
+    assert sigma_of(prior)[0] > 2.0, "the prediction itself is as unsure as the fix"
+
+
+def test_before_the_first_fix_gnss_and_the_autopilots_own_position_take_turns():
+    """Killed in flight while GNSS is spoofed: the autopilot has flown by our fixes."""
+    made = tracker(believed_sigma_m=(20.0, 4.0))
+
+    def spoofed(second):
+        return replace(state(second, (0, 0, 0), position=(400.0, 0, 100)), believed_map_m=np.array([3.0, 0.0, 100.0]))
+
+    found = [made.predict(spoofed(second)).map_from_camera.translation[0] for second in range(1, 7)]
+    assert sorted(set(np.round(found))) == [3.0, 400.0]
+    assert 2 <= found.count(3.0) <= 4
+    made.update(fix((3.0, 0, 100.0)), spoofed(7))
+    later = [made.predict(spoofed(second)).map_from_camera.translation[0] for second in (8, 9, 10)]
+    assert np.allclose(later, 3.0), "the first fix decides"
+
+
 def test_status_follows_the_outcomes():
     made = fixed()
     assert made.status is TrackerStatus.TRACK

@@ -21,6 +21,7 @@ from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.grid import RasterGrid
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.matching.types import AnyMatcher, Structural
+from ortholoc_edge.pipeline import gate, surface
 from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.gate import GateOptions
 from ortholoc_edge.pipeline.localizer import Localizer, LocalizerOptions
@@ -340,6 +341,23 @@ def test_frames_of_another_kind_are_refused(image: np.ndarray) -> None:
 @pytest.mark.parametrize("off_m", [50.0, -50.0])
 def test_datum_error_of_fifty_metres(truth: Rigid3, off_m: float) -> None:
     assert not is_wrong(localize(rendered.frame(truth), rendered.prior(truth, (0.0, 0.0, off_m))), truth)
+
+
+def test_unsettled_ground_makes_a_fix_less_certain_but_not_easier_to_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+    """3 m: said in covariance and apart from it; the gate judges by the rest."""
+    frame, prior = rendered.frame(NADIR), rendered.prior(NADIR)
+    settled = assert_near(localize(frame, prior), NADIR)
+    judged: list[np.ndarray] = []
+    check = gate.check
+    monkeypatch.setattr(surface, "unsettled_m", lambda *_: 3.0)
+    monkeypatch.setattr(gate, "check", lambda *given: judged.append(given[3]) or check(*given))
+    fix = assert_near(localize(frame, prior), NADIR)
+    ground = surface.unsettled_covariance(3.0, fix.points_map, fix.map_from_camera.translation)
+    assert fix.ground_covariance is not None and settled.ground_covariance is not None
+    assert np.allclose(fix.ground_covariance, ground)
+    assert np.allclose(fix.covariance - ground, settled.covariance - settled.ground_covariance)
+    assert np.allclose(judged[-1], fix.covariance - ground)
+    assert fix.covariance[2, 2] > 9.0
 
 
 def test_prior_sigmas_that_lie_do_not_make_a_wrong_fix() -> None:

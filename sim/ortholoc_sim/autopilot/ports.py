@@ -19,6 +19,7 @@ from ortholoc_sim.autopilot.dialect import Message, dialect
 from ortholoc_sim.line import LineOptions, Wire
 
 _READ_BYTES = 65536
+_PIECE_BYTES = 256
 
 
 class Port(Protocol):
@@ -86,7 +87,9 @@ class _MavlinkPort:
         if self._in is not None and self._out is not None:
             now_ns = self._clock.now_ns()
             for chunk in chunks:
-                self._in.send(chunk, now_ns)
+                # What was read at once was written bit by bit.
+                for start in range(0, len(chunk), _PIECE_BYTES):
+                    self._in.send(chunk[start : start + _PIECE_BYTES], now_ns)
             chunks = self._in.arrived(now_ns)
             for chunk in self._out.arrived(now_ns):
                 self._device.write(chunk)
