@@ -167,7 +167,7 @@ def test_photo_of_another_place(matcher: Matcher, localizer_of: Callable[..., Lo
     foreign = sequence.read_flight(rendered.REAL / "caliterra")
     localizers = {record.camera: localizer_of(store, matcher, record.camera) for record in foreign}
     outcomes = []
-    for index, record in enumerate(foreign[::5]):
+    for index, record in enumerate(foreign[::9]):
         for place in there[index::14]:
             frame = Frame(0, record.image(), f"{record.name} at {place.name}")
             prior = rendered.prior(place.map_from_camera, sigma_m=(10.0, 10.0))

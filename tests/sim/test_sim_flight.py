@@ -152,17 +152,6 @@ def test_the_monitor_tells_standby_from_fused(site: Site) -> None:
     assert protocol.monitor.report.state is Fusion.FUSED
 
 
-def test_without_estimates_it_drifts_off(site: Site) -> None:
-    worst = []
-    for seed in (1, 2):
-        loop = ClosedLoop(site, LoopOptions(route(site), seed=seed), START)
-        loop.advance(START + 65 * S)
-        worst.append(float(errors_after(loop)[-1]))
-    # As far as an autopilot without velocity aiding drifts in 55 s.
-    assert max(worst) < 80.0
-    assert min(worst) > 15.0
-
-
 def test_a_gimbal_on_a_moving_vehicle_is_known_at_the_exposure(site: Site) -> None:
     """It nods, the vehicle banks, turns and shakes; only the errors that its reports have are left."""
     gimbal = GimbalOptions(error_deg=(0.3, -0.4), delay_ms=30.0)

@@ -48,7 +48,7 @@ def test_estimate_is_near_the_size(textured_scene, tmp_path, changes):
 
 
 def test_estimate_of_a_real_map(real_pack, tmp_path):
-    built, sources = real_pack("seneca")
+    built, sources = real_pack("copr")
     estimate = preview_build(*sources, tmp_path / "pack", options()).estimate
     found = size(built)
     assert abs(estimate.bytes - found) < max(0.15 * found, 2 * estimate.sigma_bytes)

@@ -8,7 +8,7 @@ from rasterio.windows import from_bounds
 from ortholoc_edge.tiles.store import MapStore
 
 
-@pytest.mark.parametrize(("name", "dop_error"), [("seneca", 4.0), ("caliterra", 2.0), ("copr", 3.0), ("demo", 5.0)])
+@pytest.mark.parametrize(("name", "dop_error"), [("caliterra", 2.0), ("copr", 3.0), ("demo", 5.0)])
 def test_real_maps_survive(real_pack, name, dop_error):
     """The middle half of the map through the store, against the same pixels of the source."""
     pack, (dop_source, dsm_source) = real_pack(name)
