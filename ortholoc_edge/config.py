@@ -22,6 +22,7 @@ from ortholoc_edge.geometry import frames, rotation
 from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.rigid import Rigid3
+from ortholoc_edge.matching.types import STRUCTURAL
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
 from ortholoc_edge.pipeline.navigator import TimingOptions
 from ortholoc_edge.pipeline.tracker import TrackerOptions
@@ -191,6 +192,11 @@ class Config(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     timing: TimingOptions = field(default_factory=TimingOptions)
     log: LogOptions = field(default_factory=LogOptions)
     bus: BusOptions = field(default_factory=BusOptions)
+
+    @property
+    def reads_features(self) -> bool:
+        """Whether the pack's precomputed features are wanted: structural matching takes none."""
+        return self.localizer.precomputed_features != "never" and self.matcher.name != STRUCTURAL
 
 
 def read_config(path: Path) -> Config:

@@ -26,7 +26,7 @@ from ortholoc_edge.clock import Clock, SystemClock, wall_clock_ns
 from ortholoc_edge.config import Config, MatcherOptions, config_text
 from ortholoc_edge.errors import CameraError, LinkError, MapError, OrtholocError
 from ortholoc_edge.matching.registry import make_method
-from ortholoc_edge.matching.types import STRUCTURAL, AnyMatcher
+from ortholoc_edge.matching.types import AnyMatcher
 from ortholoc_edge.pipeline.frame import Frame, VehicleState
 from ortholoc_edge.pipeline.localizer import Localizer
 from ortholoc_edge.pipeline.navigator import Circumstances, Navigator
@@ -130,7 +130,7 @@ class Daemon:
                     Pack.open(Path(config.map.pack), public_key),
                     cache_bytes=config.map.cache_mb * 2**20,
                     memory_bytes=config.map.memory_mb * 2**20,
-                    features=config.localizer.precomputed_features != "never" and config.matcher.name != STRUCTURAL,
+                    features=config.reads_features,
                     require_intact=config.map.require_intact,
                 )
             )

@@ -284,9 +284,8 @@ class FlightLog:
         ned_from_map = frames.map_from_ned_rotation(
             self._georeference.convergence_rad(fix.map_from_camera.translation[:2])
         ).T
-        ned = cov.rotated(fix.covariance, ned_from_map)[:3, :3]
-        # Foxglove wants east, north, up.
-        enu = frames.ENU_FROM_NED @ ned @ frames.ENU_FROM_NED.T
+        # Foxglove wants true east, north, up.
+        enu = cov.rotated(fix.covariance, frames.ENU_FROM_NED @ ned_from_map)[:3, :3]
         return msgspec.json.encode(
             {
                 "timestamp": _time(unix_ns),

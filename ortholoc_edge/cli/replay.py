@@ -25,7 +25,6 @@ from ortholoc_edge.cli.arguments import length, non_negative, seed, sigma_triple
 from ortholoc_edge.config import config_from_text
 from ortholoc_edge.daemon import configured_matcher, make_navigator
 from ortholoc_edge.errors import ConfigError, DatasetError, OrtholocError
-from ortholoc_edge.matching.types import STRUCTURAL
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
 from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.store import MapStore
@@ -114,8 +113,7 @@ def _fly_again(logs: list[Path], args: argparse.Namespace) -> int:
     matcher = configured_matcher(config.matcher)
     if args.out:
         writable_folder(args.out, "--out")
-    features = config.localizer.precomputed_features != "never" and config.matcher.name != STRUCTURAL
-    with MapStore(Pack.open(pack), features=features) as store:
+    with MapStore(Pack.open(pack), features=config.reads_features) as store:
         if store.pack.manifest_sha256 != header.pack_sha256:
             raise DatasetError(
                 f"{pack}: not the pack that was flown with, its manifest differs; name that one with --pack"

@@ -6,6 +6,7 @@ import argparse
 import re
 import sys
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 from tqdm import tqdm
@@ -98,15 +99,16 @@ def _make(args: argparse.Namespace) -> int:
     location = args.location or re.sub(r"[^A-Za-z0-9-]+", "-", args.flight.resolve().name)
     folder = _folder(args)
     options = MakerOptions(seed=args.seed)
-    with MapStore(Pack.open(args.pack), max_pixels=_MAX_PIXELS) as store:
-        if args.truth is None:
-            made = _of_flight(recorded, PackScenery(store), f"{location}_{args.kind}", options)
-            return _write(made, len(recorded), folder)
-        with MapStore(Pack.open(args.truth), max_pixels=_MAX_PIXELS) as truth:
-            if truth.pack.manifest.crs != store.pack.manifest.crs:
-                raise ConfigError(f"--truth {args.truth}: another CRS than {args.pack}'s; build one of them anew")
-            made = _of_flight(recorded, PackScenery(store, truth), f"{location}_{args.kind}", options)
-            return _write(made, len(recorded), folder)
+    with (
+        MapStore(Pack.open(args.pack), max_pixels=_MAX_PIXELS) as store,
+        nullcontext(store)
+        if args.truth is None
+        else MapStore(Pack.open(args.truth), max_pixels=_MAX_PIXELS) as truth,
+    ):
+        if truth.pack.manifest.crs != store.pack.manifest.crs:
+            raise ConfigError(f"--truth {args.truth}: another CRS than {args.pack}'s; build one of them anew")
+        made = _of_flight(recorded, PackScenery(store, truth), f"{location}_{args.kind}", options)
+        return _write(made, len(recorded), folder)
 
 
 def _of_flight(

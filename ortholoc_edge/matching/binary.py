@@ -12,7 +12,7 @@ import numpy.typing as npt
 from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, ImageArray
 from ortholoc_edge.matching.nearest import mutual_nearest
 from ortholoc_edge.matching.types import Features, Matches
-from ortholoc_edge.matching.working_image import MIN_SIDE_PX, working_image
+from ortholoc_edge.matching.working_image import MIN_SIDE_PX, shrunk_image
 
 _ANY_COSINE: Final = -1.0
 # Grey levels. Right matches (5 px of the truth) on the samples seneca, caliterra, demo, copr at 640 px: 18, 206, 56,
@@ -64,9 +64,7 @@ class BinaryMatcher:
         An image that is tiny, constant or invalid throughout has no features, which is no error.
         Raises: ValueError if image or mask have another type or shape.
         """
-        rows, columns = image.shape[:2]
-        shrink = min(1.0, self.working_px / max(rows, columns, 1))
-        work = working_image(image, valid, max(1, round(columns * shrink)), max(1, round(rows * shrink)))
+        work = shrunk_image(image, valid, self.working_px)
         if work is None:
             return self._no_features()
         # Per call: OpenCV does not promise that a detector may serve two threads.
@@ -75,12 +73,7 @@ class BinaryMatcher:
             return self._no_features()
         pixels = self._pixels(keypoints, work.image.shape)
         scores = np.array([keypoint.response for keypoint in keypoints], dtype=np.float32)
-        order = np.argsort(-scores, kind="stable")
-        if work.usable is not None:
-            last = [[work.image.shape[1] - 1], [work.image.shape[0] - 1]]
-            u, v = np.clip(np.rint(pixels).astype(np.intp).T, 0, last)
-            order = order[work.usable[v, u][order]]
-        order = order[: self._max_keypoints]
+        order = work.strongest(pixels, scores, self._max_keypoints)
         return Features(work.original_px(pixels[order]), scores[order], _signs(packed[order]))
 
     def _pixels(self, keypoints: Any, shape: tuple[int, ...]) -> FloatArray:

@@ -10,7 +10,7 @@ import numpy as np
 from ortholoc_edge.geometry.arrays import BoolArray, ImageArray
 from ortholoc_edge.matching.nearest import mutual_nearest
 from ortholoc_edge.matching.types import Features, Matches
-from ortholoc_edge.matching.working_image import MIN_SIDE_PX, working_image
+from ortholoc_edge.matching.working_image import MIN_SIDE_PX, shrunk_image
 
 _DESCRIPTOR: Final = 128
 _ANY_COSINE: Final = -1.0
@@ -49,10 +49,7 @@ class SiftMatcher:
         An image that is tiny, constant or invalid throughout has no features, which is no error.
         Raises: ValueError if image or mask have another type or shape.
         """
-        rows, columns = image.shape[:2]
-        shrink = min(1.0, self.working_px / max(rows, columns, 1))
-        width, height = max(1, round(columns * shrink)), max(1, round(rows * shrink))
-        work = working_image(image, valid, width, height)
+        work = shrunk_image(image, valid, self.working_px)
         if work is None:
             return _no_features()
         # Without enable_precise_upscale keypoints are a quarter pixel off (seen on the recorded samples). A
@@ -65,13 +62,8 @@ class SiftMatcher:
             return _no_features()
         pixels = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64)
         scores = np.array([keypoint.response for keypoint in keypoints], dtype=np.float32)
-        order = np.argsort(-scores, kind="stable")
-        if work.usable is not None:
-            u, v = np.clip(
-                np.rint(pixels).astype(np.intp).T, 0, [[work.image.shape[1] - 1], [work.image.shape[0] - 1]]
-            )
-            order = order[work.usable[v, u][order]]
-        order = order[: self._max_keypoints]  # OpenCV keeps more where the last ones tie
+        # OpenCV keeps more than asked for where the last ones tie.
+        order = work.strongest(pixels, scores, self._max_keypoints)
         # RootSIFT: the root of the L1-normalised histogram is of unit length.
         histograms = raw[order]
         sums = np.maximum(histograms.sum(axis=1, keepdims=True), np.float32(1e-12))

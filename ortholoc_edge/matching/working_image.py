@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from ortholoc_edge.geometry.arrays import BoolArray, FloatArray, ImageArray
+from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
 from ortholoc_edge.geometry.grid import resize_px
 
 # No detector finds anything of use in less, and rounding would distort it beyond recognition.
@@ -40,6 +40,22 @@ class WorkingImage:
     def original_px(self, px: npt.ArrayLike) -> FloatArray:
         """Working pixels (N, 2) in the pixels of the original image."""
         return resize_px(px, self.scale)
+
+    def strongest(self, px: FloatArray, scores: Float32Array, most: int) -> IntArray:
+        """Which of some keypoints (N, 2), with scores (N,), to keep: the best ``most`` usable ones, best first."""
+        order = np.argsort(-scores, kind="stable")
+        if self.usable is not None:
+            rows, columns = self.usable.shape
+            u, v = np.clip(np.rint(px).astype(np.intp).T, 0, [[columns - 1], [rows - 1]])
+            order = order[self.usable[v, u][order]]
+        return order[:most]
+
+
+def shrunk_image(image: ImageArray, valid: BoolArray | None, working_px: int) -> WorkingImage | None:
+    """`working_image` with a long side of ``working_px``; a smaller image stays as it is."""
+    rows, columns = image.shape[:2]
+    shrink = min(1.0, working_px / max(rows, columns, 1))
+    return working_image(image, valid, max(1, round(columns * shrink)), max(1, round(rows * shrink)))
 
 
 def working_image(image: ImageArray, valid: BoolArray | None, width: int, height: int) -> WorkingImage | None:
