@@ -24,8 +24,9 @@ from ortholoc_edge.bench.runner import run_flight
 from ortholoc_edge.errors import DatasetError
 from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, ImageArray
 from ortholoc_edge.matching.types import AnyMatcher
+from ortholoc_edge.parallel import Workers
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
-from ortholoc_edge.tiles.build import PackOptions, Workers, build_pack
+from ortholoc_edge.tiles.build import PackOptions, build_pack
 from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.store import CACHE_BYTES, MapStore
 

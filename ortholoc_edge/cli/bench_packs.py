@@ -22,7 +22,8 @@ from ortholoc_edge.cli.progress import ProgressBar
 from ortholoc_edge.errors import ConfigError, DatasetError
 from ortholoc_edge.matching.registry import MATCHERS, METHODS, make_method
 from ortholoc_edge.matching.types import STRUCTURAL
-from ortholoc_edge.tiles.build import PackOptions, Workers, build_pack
+from ortholoc_edge.parallel import Workers
+from ortholoc_edge.tiles.build import PackOptions, build_pack
 from ortholoc_edge.tiles.features import MATCHERS as FEATURE_MATCHERS
 from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.store import CACHE_BYTES

@@ -15,9 +15,10 @@ from tqdm import tqdm
 
 from ortholoc_edge.cli.tiles_inspect import print_facts
 from ortholoc_edge.errors import ConfigError
+from ortholoc_edge.parallel import Workers
 from ortholoc_edge.tiles import features
 from ortholoc_edge.tiles.area import read_area
-from ortholoc_edge.tiles.build import PackOptions, Preview, Workers, build_pack, preview_build
+from ortholoc_edge.tiles.build import PackOptions, Preview, build_pack, preview_build
 from ortholoc_edge.tiles.signature import signer
 
 _UNITS = {"": 1.0, "K": 1e3, "M": 1e6, "G": 1e9, "T": 1e12, "KI": 2.0**10, "MI": 2.0**20, "GI": 2.0**30}

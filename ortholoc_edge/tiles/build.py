@@ -20,6 +20,7 @@ import msgspec
 import numpy as np
 
 from ortholoc_edge.errors import ConfigError, MapError
+from ortholoc_edge.parallel import Workers
 from ortholoc_edge.tiles import alignment, coverage, encode, features, matchability, stac, vrt
 from ortholoc_edge.tiles.area import Area
 from ortholoc_edge.tiles.budget import Estimate, Sampler, Settings, settings_within
@@ -169,14 +170,6 @@ def _is_date(text: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-@dataclass(frozen=True, slots=True)
-class Workers:
-    """Where a build runs: ``processes`` of this machine, or the Dask cluster at ``dask``."""
-
-    processes: int = 1
-    dask: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -540,7 +533,7 @@ class _Build:
         return [record for job in jobs if (record := records[job]) is not None]
 
     def _run(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, Record | Source]]:
-        return run_all(jobs, self._work, processes=self._workers.processes, dask=self._workers.dask)
+        return run_all(jobs, self._work, self._workers)
 
     # -- what it makes -----------------------------------------------------------------------------------
 

@@ -8,18 +8,11 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import importlib
-import logging
 import os
-import queue
-import signal
-import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -30,9 +23,11 @@ import rasterio
 from rasterio.errors import RasterioError
 from rasterio.io import MemoryFile
 
+from ortholoc_edge import parallel
 from ortholoc_edge.errors import ConfigError, MapError, OrtholocError
 from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, ImageArray
 from ortholoc_edge.matching.registry import make_matcher
+from ortholoc_edge.parallel import Purpose, Workers
 from ortholoc_edge.tiles import coverage, encode, features, matchability
 from ortholoc_edge.tiles.area import MapArea
 from ortholoc_edge.tiles.cog import Cog, quiet_georeference
@@ -44,13 +39,10 @@ from ortholoc_edge.tiles.mosaic import dop_mosaic, dsm_mosaic
 from ortholoc_edge.tiles.prepare import prepare
 from ortholoc_edge.tiles.sources import Source, fingerprint
 
-logger = logging.getLogger(__name__)
-
 # Part of every hash: raise it when the same input makes other bytes.
 _RECIPE = 3
 _WORKER_CACHE_BYTES = 64 * 2**20
-_PR_SET_PDEATHSIG = 1
-_DASK_PATIENCE_S = 30.0
+_PURPOSE = Purpose("build", MapError)
 # Of SHA-256, before each record: a disk that lost power may hand back anything.
 _DIGEST_BYTES = 32
 
@@ -139,7 +131,6 @@ class FeatureJob:
 TileJob = DopJob | DsmJob | FeatureJob
 Job = PrepareJob | TileJob
 _J = TypeVar("_J", bound=Job)
-Run = Callable[[Job, Path], "Record | Source"]
 
 
 def job_name(job: Job) -> str:
@@ -340,112 +331,33 @@ def _sha256(data: bytes) -> str:
 # -- where the pieces run ------------------------------------------------------------------------------
 
 
-def run_all(
-    jobs: Sequence[_J], folder: Path, *, processes: int = 1, dask: str | None = None
-) -> Iterator[tuple[_J, Record | Source]]:
+def run_all(jobs: Sequence[_J], folder: Path, workers: Workers = Workers()) -> Iterator[tuple[_J, Record | Source]]:  # noqa: B008
     """Run pieces of work and give each with its result, in any order.
 
     Args:
-        folder: where files and records go; with ``dask`` all workers must see it under this path.
-        processes: on this machine; 1 works in this process.
-        dask: address of a Dask scheduler, instead of processes here.
+        folder: where files and records go; with Dask all workers must see it under this path.
     Raises: MapError and ConfigError of the pieces; MapError if a worker dies; ConfigError without Dask.
     """
-    if not jobs:
-        return
-    if dask is not None:
-        yield from _on_dask(jobs, folder, dask)
-    elif processes <= 1 or len(jobs) == 1:
+    if workers.dask is None and (workers.processes <= 1 or len(jobs) <= 1):
+        # Here errors need not be values, so they are as they were raised.
         for job in jobs:
             yield job, run_job(job, folder)
-    else:
-        yield from _in_processes(jobs, folder, min(processes, len(jobs)))
+        return
+    work = functools.partial(_guarded, folder=folder)
+    with _probe(folder) as seen:
+        for job, result in parallel.run_all(jobs, work, workers, _PURPOSE, name=job_name, seen=seen):
+            yield job, _unpacked(result)
 
 
-def _in_processes(jobs: Sequence[_J], folder: Path, processes: int) -> Iterator[tuple[_J, Record | Source]]:
-    # Spawned: a fork would copy GDAL's and OpenCV's locks in whatever state they are.
-    pool = ProcessPoolExecutor(processes, get_context("spawn"), initializer=_start_worker, initargs=(os.getpid(),))
-    try:
-        waiting = iter(jobs)
-        running: dict[Future[Any], _J] = {}
-        for job in waiting:
-            running[pool.submit(_guarded, job, folder)] = job
-            if len(running) < 2 * processes:
-                continue
-            yield from _collected(running)
-        while running:
-            yield from _collected(running)
-    except BrokenProcessPool as err:
-        raise MapError("a process of the build died, perhaps for lack of memory; use fewer: --jobs 1") from err
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _collected(running: dict[Future[Any], _J]) -> Iterator[tuple[_J, Record | Source]]:
-    for future in wait(running, return_when=FIRST_COMPLETED).done:
-        job = running.pop(future)
-        yield job, _unpacked(future.result())
-
-
-def _on_dask(jobs: Sequence[_J], folder: Path, address: str) -> Iterator[tuple[_J, Record | Source]]:
-    try:
-        distributed: Any = importlib.import_module("dask.distributed")
-    except ImportError as err:
-        raise ConfigError("--dask needs Dask; install it with: pip install 'ortholoc-edge[dask]'") from err
-    try:
-        client = distributed.Client(address, timeout="5s", set_as_default=False)
-    except (OSError, ValueError) as err:
-        raise ConfigError(f"--dask {address}: no scheduler answers ({err}); start one with: dask scheduler") from err
-    with client:
-        _check_shared(client, folder, address)
-        futures = {client.submit(_guarded, job, folder, key=job_name(job), pure=False): job for job in jobs}
-        done: queue.Queue[Any] = queue.Queue()
-        for future in futures:
-            future.add_done_callback(done.put)
-        try:
-            while futures:
-                try:
-                    future = done.get(timeout=_DASK_PATIENCE_S)
-                except queue.Empty as err:
-                    # A scheduler whose workers have all gone waits for new ones, for ever.
-                    if not client.scheduler_info()["workers"]:
-                        raise MapError(f"--dask {address}: all workers have gone; start some and build again") from err
-                    continue
-                if future.status != "finished":
-                    raise MapError(f"--dask {address}: a task failed ({future.exception()}); see the workers' logs")
-                yield futures.pop(future), _unpacked(future.result())
-        finally:
-            client.cancel(list(futures))
-
-
-def _check_shared(client: Any, folder: Path, address: str) -> None:
+@contextmanager
+def _probe(folder: Path) -> Iterator[Path]:
+    """A file that only who shares the folder sees: elsewhere there may be one of its name."""
     probe = folder / f".shared.{os.getpid()}"
     probe.touch()
     try:
-        seen = client.run(Path.exists, probe)
-    except (ImportError, AttributeError, ValueError) as err:
-        raise ConfigError(f"--dask {address}: workers do not answer ({err})") from err
+        yield probe
     finally:
         probe.unlink()
-    if not seen:
-        raise ConfigError(f"--dask {address}: the scheduler has no workers; start some with: dask worker {address}")
-    blind = sorted(worker for worker, there in seen.items() if not there)
-    if blind:
-        raise ConfigError(
-            f"--dask {address}: worker {blind[0]} does not see {folder}; sources and output must lie on a file system"
-            " that all workers share, under one path"
-        )
-
-
-def _start_worker(parent: int) -> None:
-    if sys.platform == "linux":
-        # A worker must not live on when the build is killed.
-        import ctypes
-
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:
-            os._exit(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _guarded(job: Job, folder: Path) -> Record | Source | tuple[str, str]:

@@ -11,9 +11,10 @@ import pytest
 from tile_rasters import contents
 
 from ortholoc_edge.errors import ConfigError, MapError
+from ortholoc_edge.parallel import Workers, check_seen
 from ortholoc_edge.tiles import build, tasks
 from ortholoc_edge.tiles.area import read_area
-from ortholoc_edge.tiles.build import PackOptions, Workers, build_pack
+from ortholoc_edge.tiles.build import PackOptions, build_pack
 from ortholoc_edge.tiles.lattice import Lattice, PixelBox
 from ortholoc_edge.tiles.tasks import DopJob, DsmJob, PrepareJob, Record, finished, job_name, run_all
 
@@ -223,7 +224,7 @@ def _die(job, folder):
 def test_death_of_a_process_is_said(tmp_path, monkeypatch):
     monkeypatch.setattr(tasks, "_guarded", _die)
     with pytest.raises(MapError, match=r"process of the build died.*--jobs 1"):
-        list(run_all([Kill(1), Kill(2), Kill(3)], tmp_path, processes=2))
+        list(run_all([Kill(1), Kill(2), Kill(3)], tmp_path, Workers(2)))
 
 
 def _raise(job, folder):
@@ -318,8 +319,7 @@ def test_dask_worker_must_see_the_folder(wide_scene, tmp_path, cluster, monkeypa
             return {"tcp://one:1": True, "tcp://two:2": False}
 
     with pytest.raises(ConfigError, match=r"worker tcp://two:2 does not see .*all workers share"):
-        tasks._check_shared(Elsewhere(), tmp_path, "tcp://s:1")
-    assert list(tmp_path.iterdir()) == []
+        check_seen(Elsewhere(), tmp_path, "tcp://s:1")
 
 
 @pytest.mark.filterwarnings("default")
