@@ -1,156 +1,214 @@
-"""``bench``: the table of docs/benchmarks.md, measured, and studies on samples."""
+"""``bench``: the paper's benchmark on samples."""
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
+import logging
 import sys
-import tempfile
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
-from itertools import product
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import msgspec
-import numpy as np
 from tqdm import tqdm
 
-from ortholoc_edge.bench import metrics, sequence
-from ortholoc_edge.bench.replay import FrameResult, PriorKind, PriorNoise
-from ortholoc_edge.bench.runner import SAMPLES_PACK, prior_used, run_flight, run_samples, summarise
-from ortholoc_edge.bench.samples import sample_paths
-from ortholoc_edge.bench.sets import RecordedSet, find_sets
-from ortholoc_edge.cli import bench_study
+from ortholoc_edge.bench import bench_page, campaign, cases, studies
+from ortholoc_edge.bench.campaign import GROUND_TRUTH, MatcherSetup, Piece, Plan, Settings, Store
+from ortholoc_edge.bench.paper import PaperOptions, Task
+from ortholoc_edge.bench.plots import study_plot
+from ortholoc_edge.bench.samples import SampleKind, Split, find_samples
+from ortholoc_edge.bench.studies import STUDIES, Study
+from ortholoc_edge.bench.tables import Table
 from ortholoc_edge.cli.arguments import positive_int
 from ortholoc_edge.cli.progress import ProgressBar
-from ortholoc_edge.errors import ConfigError, OrtholocError
-from ortholoc_edge.matching.registry import METHODS, make_method
-from ortholoc_edge.matching.types import AnyMatcher
-from ortholoc_edge.pipeline.localizer import LocalizerOptions
-from ortholoc_edge.tiles.build import PackOptions, build_pack
-from ortholoc_edge.tiles.store import MapStore
+from ortholoc_edge.errors import OrtholocError
+from ortholoc_edge.geometry.arrays import ImageArray
+from ortholoc_edge.matching import models
+from ortholoc_edge.matching.registry import MATCHERS
+from ortholoc_edge.parallel import Workers
 
-_HEADING = (
-    "| set | matcher | prior | AdHoP | frames | recall 1m-1° | 3m-3° | 5m-5° | TE median / p90 / max m | RE median ° | "
-    "false fixes | NEES mean (6) | CPU ms |\n"
-    "|---|---|---|---|---|---|---|---|---|---|---|---|---|"
-)
+logger = logging.getLogger(__name__)
+
+_ADHOP = {"on": (True,), "off": (False,), "both": (False, True)}
+_REPORT, _TABLES = "report.html", "tables"
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = subparsers.add_parser(
         "bench",
-        help="measure matchers, priors and AdHoP on real sequences",
-        description="Replays every set below DATA (folders with *_flight.csv, *_dop.tif and *_dsm.tif, or with .npz "
-        "samples, or with a subfolder samples of these) with each matcher, prior and AdHoP setting, over several "
-        "seeds, and prints a Markdown table. "
-        "NEES and errors are over the fixes of all seeds, recall over all frames; CPU is the median of this "
-        "process per frame, all threads. Samples have no past: every prior but none is truth-noise. A set that fails "
-        "is reported on stderr, the next ones go on, and the exit code is 1.",
+        help="compare matchers as the paper does, on OrthoLoC samples",
+        description="Matches the photo of every sample below SAMPLES with its whole map, without any prior, and "
+        "solves for the pose, or for the focal length too. Prints Markdown tables of the paper's metrics. With --out "
+        "it writes them as Markdown, CSV and LaTeX, plots and a report with pictures, and a run that was cut off goes "
+        "on where it was. A sample that can't be used is reported on stderr and the exit code is 1.",
     )
-    parser.add_argument("data", type=Path, metavar="DATA")
+    parser.add_argument("samples", type=Path, metavar="SAMPLES", help="a file, or a folder and all below it")
     parser.add_argument(
-        "--matchers", nargs="+", choices=METHODS, default=["structural", "xfeat", "sift"],
-        help="default: %(default)s",
+        "--matcher", type=_names([*MATCHERS, GROUND_TRUTH]), default=["xfeat", "sift"], metavar="A,B",
+        help=f"{', '.join(MATCHERS)}, and {GROUND_TRUTH}: the truth as matches (default: xfeat,sift)",
+    )  # fmt: skip
+    parser.add_argument("--adhop", choices=list(_ADHOP), default="both", help="default: %(default)s")
+    parser.add_argument(
+        "--task", type=_names([str(task) for task in Task]), default=[str(Task.LOCALIZE)], metavar="A,B",
+        help=f"{', '.join(Task)} (default: localize)",
     )  # fmt: skip
     parser.add_argument(
-        "--priors", nargs="+", choices=[str(k) for k in PriorKind], default=["odometer", "none"],
-        help="default: %(default)s",
+        "--study", type=_names(list(STUDIES)), default=[], metavar="A,B",
+        help=f"{', '.join(STUDIES)}: errors against each, as a table and a plot. confidence is of {GROUND_TRUTH} alone",
     )  # fmt: skip
-    parser.add_argument("--adhop", nargs="+", choices=["on", "off"], default=["on", "off"], help="default: both")
-    parser.add_argument("--seeds", type=positive_int, default=5, help="how many, from 0 (default: %(default)s)")
+    parser.add_argument("--kind", type=_names([str(kind) for kind in SampleKind]), metavar="A,B", help="default: all")
+    parser.add_argument("--split", type=_names([str(split) for split in Split]), metavar="A,B", help="default: all")
+    parser.add_argument("--limit", type=positive_int, metavar="N", help="the first N samples of each kind")
     parser.add_argument(
-        "--working-px", type=positive_int, default=640, help="a multiple of 32 for xfeat (default: %(default)s)"
+        "--turns", type=int, choices=(1, 2, 4), default=4,
+        help="the map is shown in so many quarter turns and the one with most matches counts (default: %(default)s)",
     )  # fmt: skip
-    parser.add_argument("--max-keypoints", type=positive_int, default=4096, help="default: %(default)s")
-    parser.add_argument("--json", action="store_true", help="print one JSON object per row instead of the table")
-    bench_study.add_arguments(parser)
+    parser.add_argument(
+        "--working-px", type=positive_int, default=640,
+        help="long side at which matchers see pictures; a multiple of 32 (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--max-keypoints", type=positive_int, default=2048, help="a picture (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="of all that is drawn (default: %(default)s)")
+    parser.add_argument("--jobs", type=positive_int, default=1, help="processes (default: %(default)s)")
+    parser.add_argument(
+        "--dask", metavar="ADDRESS", help="scheduler of a Dask cluster whose workers see SAMPLES, instead of --jobs"
+    )
+    parser.add_argument("--json", action="store_true", help="one JSON object per sample and matcher instead of tables")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="results, tables, plots and report.html")
     parser.set_defaults(run=run)
 
 
+def _names(known: Sequence[str]) -> Callable[[str], list[str]]:
+    def parse(text: str) -> list[str]:
+        names = list(dict.fromkeys(text.split(",")))
+        for name in names:
+            if name not in known:
+                raise argparse.ArgumentTypeError(f"{name!r} is not known; known are: {', '.join(known)}")
+        return names
+
+    return parse
+
+
 def run(args: argparse.Namespace) -> int:
-    if args.study is not None:
-        return bench_study.run(args)
-    if args.kinds or args.splits:
-        raise ConfigError("--kinds and --splits are of studies; name one with --study, or leave them out")
-    found = find_sets(args.data)
-    # Before the sets: what is wrong here is wrong for all of them.
-    matchers = {name: _matcher(name, args) for name in args.matchers}
+    asked = [study for name in args.study for study in STUDIES[name]]
+    # Of blunders in the samples' heights, which each of their many readings would tell again.
+    logging.getLogger("ortholoc_edge.bench.samples").setLevel(logging.ERROR)
+    plan = _plan(args, asked)
+    jobs = plan.jobs()
+    settings = Settings(working_px=args.working_px, max_keypoints=args.max_keypoints, options=plan.options)
+    store = Store(settings, args.out)
+    failures = _measure(plan, store, Workers(args.jobs, args.dask))
+    pieces = store.pieces(jobs)
+    if args.json:
+        for piece in pieces:
+            print(msgspec.json.encode(piece).decode())
+    tables = list(_tables(pieces, asked, plan.tasks))
     if not args.json:
-        print(_HEADING)
-    failed = []
-    with tempfile.TemporaryDirectory(prefix="ortholoc-bench-") as scratch:
-        for one in found:
-            try:
-                _measure(one, matchers, Path(scratch), args)
-            except OrtholocError as error:
-                print(f"ortholoc-edge: {one.name}: {error}", file=sys.stderr)
-                failed.append(one.name)
-    if failed:
-        print(f"ortholoc-edge: {len(failed)} of {len(found)} sets failed: {', '.join(failed)}", file=sys.stderr)
-    return 1 if failed else 0
+        print("\n".join(f"### {table.title}\n\n{table.markdown()}" for table, _ in tables))
+    if args.out is not None and pieces:
+        _write(args.out, plan, pieces, tables)
+    if failures:
+        print(f"ortholoc-edge: {failures} of {len(jobs)} pieces of work failed", file=sys.stderr)
+    return 1 if failures else 0
 
 
-def _matcher(name: str, args: argparse.Namespace) -> AnyMatcher:
-    with ProgressBar(f"model {name}") as bar:
-        return make_method(
-            name, working_px=args.working_px, max_keypoints=args.max_keypoints, threads=1, progress=bar.step
-        )
-
-
-def _measure(one: RecordedSet, matchers: Mapping[str, AnyMatcher], scratch: Path, args: argparse.Namespace) -> None:
-    store = _store(one, scratch)
-    try:
-        for summary in _rows(one, store, matchers, args):
-            print(msgspec.json.encode(summary).decode() if args.json else _row(summary), flush=True)
-    finally:
-        if store is not None:
-            store.close()
-
-
-def _store(one: RecordedSet, scratch: Path) -> MapStore | None:
-    if one.dop is None or one.dsm is None:
-        return None
-    return MapStore(build_pack(one.dop, one.dsm, scratch / one.name, PackOptions(quality=85, vertical="unknown")))
-
-
-def _rows(
-    one: RecordedSet, store: MapStore | None, matchers: Mapping[str, AnyMatcher], args: argparse.Namespace
-) -> Iterator[metrics.Summary]:
-    # Samples know fewer priors than can be asked for: none is measured twice.
-    priors = dict.fromkeys(prior_used(PriorKind(asked), samples=store is None) for asked in args.priors)
-    for (name, matcher), prior, adhop in product(matchers.items(), priors, args.adhop):
-        options = LocalizerOptions(adhop=adhop == "on")
-        results: list[FrameResult] = []
-        for seed in tqdm(range(args.seeds), desc=f"{one.name} {name} {prior}", file=sys.stderr, leave=False):
-            results += [replace(r, image=None) for r in _frames(one, store, matcher, options, prior, seed)]
-        yield summarise(
-            results,
-            name=one.name,
-            pack=SAMPLES_PACK if store is None else "built from the set",
-            matcher=matcher,
-            prior=prior,
-            adhop=options.adhop,
-            seed=0,
-            seeds=args.seeds,
-        )
-
-
-def _frames(
-    one: RecordedSet, store: MapStore | None, matcher: AnyMatcher, options: LocalizerOptions, kind: PriorKind, seed: int
-) -> Iterator[FrameResult]:
-    noise = PriorNoise()
-    if store is None:
-        return run_samples(sample_paths(one.folder), matcher, options, kind, noise, seed)
-    return run_flight(sequence.read_flight(one.folder), store, matcher, options, kind, noise, seed)
-
-
-def _row(s: metrics.Summary) -> str:
-    def number(value: float | None, digits: int) -> str:
-        return "-" if value is None or not np.isfinite(value) else f"{value:.{digits}f}"
-
-    te = " / ".join(number(v, 2) for v in (s.te_m.median, s.te_m.p90, s.te_m.max))
-    recall = " | ".join(f"{100 * part:.1f} %" for part in s.recall.values())
-    return (
-        f"| {s.sequence} | {s.matcher} | {s.prior} | {'on' if s.adhop else 'off'} | {s.frames} | {recall} | {te} | "
-        f"{number(s.re_deg.median, 2)} | {s.false_fixes} | {number(s.nees.mean, 1)} | {s.cpu_ms_per_frame:.0f} |"
+def _plan(args: argparse.Namespace, asked: Sequence[Study]) -> Plan:
+    names = list(args.matcher)
+    if any(study.of_truth for study in asked) and GROUND_TRUTH not in names:
+        names.append(GROUND_TRUTH)
+    kinds = None if args.kind is None else [SampleKind(kind) for kind in args.kind]
+    splits = None if args.split is None else [Split(split) for split in args.split]
+    files = find_samples(args.samples, kinds, splits)
+    if args.limit is not None:
+        files = [one for kind in SampleKind for one in [f for f in files if f.kind is kind][: args.limit]]
+    return Plan(
+        args.samples,
+        files,
+        [_setup(name, args) for name in names],
+        {name: studies.conditions_for(name, asked) for name in names},
+        [Task(task) for task in args.task],
+        _ADHOP[args.adhop],
+        PaperOptions(turns=args.turns, seed=args.seed),
     )
+
+
+def _setup(name: str, args: argparse.Namespace) -> MatcherSetup:
+    # Built here if need be: workers only load it.
+    for model in _models_of(name):
+        with ProgressBar(f"model {model}") as bar:
+            models.ensure(model, bar.step)
+    return campaign.setup_of(name, args.working_px, args.max_keypoints)
+
+
+def _models_of(name: str) -> tuple[str, ...]:
+    return (name, *models.known(name).needs) if name in models.CATALOGUE else ()
+
+
+def _measure(plan: Plan, store: Store, workers: Workers) -> int:
+    """How many pieces failed, which are reported."""
+    failed = 0
+    with tqdm(total=0, unit="piece", file=sys.stderr, leave=False) as bar:
+        for done, total, failure in campaign.run(plan, store, workers):
+            if bar.total != total:
+                # What is there from an earlier run says nothing about how fast this one is.
+                bar.reset(total)
+                bar.initial = done
+            bar.update(done - bar.n)
+            if failure is not None:
+                failed += 1
+                tqdm.write(f"ortholoc-edge: {failure.why}", file=sys.stderr)
+    return failed
+
+
+def _tables(
+    pieces: Sequence[Piece], asked: Sequence[Study], tasks: Sequence[Task]
+) -> Iterator[tuple[Table, Study | None]]:
+    for task in tasks:
+        yield studies.main_table(pieces, task), None
+        changes = studies.adhop_table(pieces, task)
+        if changes.rows:
+            yield changes, None
+        for study in asked:
+            yield studies.study_table(pieces, study, task), study
+
+
+def _write(
+    folder: Path, plan: Plan, pieces: Sequence[Piece], tables: Sequence[tuple[Table, Study | None]]
+) -> None:
+    can_plot = importlib.util.find_spec("matplotlib") is not None
+    if not can_plot and any(study is not None for _, study in tables):
+        logger.warning("no plots: install matplotlib with pip install 'ortholoc-edge[report]' and run this again")
+    with_plots = [
+        (table, study_plot(table, study.headings) if study is not None and can_plot and table.rows else None)
+        for table, study in tables
+    ]
+    models_used = {setup.name: setup.model_sha256 for setup in plan.matchers}
+    notes = [
+        f"{len({piece.sample for piece in pieces})} samples of {plan.source.absolute().name}; {plan.options.turns} "
+        f"quarter turns, {pieces[0].results[0].condition.min_confidence:g} least confidence, no prior",
+        "models: " + ", ".join(f"{name} {sha[:12] if sha else 'without weights'}" for name, sha in models_used.items()),
+        "A sample without a pose counts as infinitely wrong, in medians too. Times are of one thread beside whatever "
+        "else ran.",
+    ]
+    try:
+        (folder / _TABLES).mkdir(exist_ok=True)
+        for table, plot in with_plots:
+            stem = folder / _TABLES / table.name
+            stem.with_suffix(".md").write_text(table.markdown(), "utf-8")
+            stem.with_suffix(".csv").write_text(table.csv(), "utf-8")
+            stem.with_suffix(".tex").write_text(table.latex(), "utf-8")
+            if plot is not None:
+                stem.with_suffix(".png").write_bytes(plot)
+        text = bench_page.page("Matchers compared", notes, with_plots, _pictures(plan, pieces))
+        (folder / _REPORT).write_text(text, "utf-8")
+    except OSError as err:
+        raise OrtholocError(f"{folder}: can't write the report ({err}); free space and run again") from err
+
+
+def _pictures(plan: Plan, pieces: Sequence[Piece]) -> Iterator[tuple[str, ImageArray]]:
+    jobs = plan.jobs()
+    for task in plan.tasks:
+        chosen = cases.choose(pieces, jobs, task)
+        drawn = cases.drawn(chosen, task)
+        for case, picture in tqdm(drawn, total=len(chosen), unit="picture", file=sys.stderr, leave=False):
+            yield f"{task}, {case.title}: {case.job.sample}", picture

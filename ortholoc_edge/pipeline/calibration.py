@@ -72,9 +72,9 @@ def calibrate_photos(
             dropped |= {name: _no_pose(views[name], limits) for name in names}
             break
         refused = {
-            name: refusal
+            name: why
             for name, estimate in zip(names, found.views, strict=True)
-            if (refusal := _refusal(views[name], estimate, camera, limits)) is not None
+            if (why := refusal(views[name], estimate, camera, limits)) is not None
         }
         if not refused:
             ill = calibrate.ill_posed(found)
@@ -95,7 +95,7 @@ def calibrate_photos(
     )
 
 
-def _refusal(
+def refusal(
     view: View, estimate: pnp.PoseEstimate | None, camera: Camera, limits: gate.GateOptions
 ) -> gate.Refusal | None:
     """Why a photo takes no part: what the gate would say of its pose."""
