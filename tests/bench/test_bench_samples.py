@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_samples import by_confidence
 
 from ortholoc_edge.bench import samples
-from ortholoc_edge.bench.confidence import confidence_errors
 from ortholoc_edge.bench.ground_truth import GroundTruthMatcher
 from ortholoc_edge.bench.runner import sample_store
 from ortholoc_edge.errors import DatasetError
@@ -362,7 +362,7 @@ def test_confident_true_matches_of_real_samples_give_the_true_pose(name):
     path = REAL / f"{name}.npz"
     if not path.is_file():
         pytest.skip(f"{path} is not there: the real samples lie outside the repository")
-    found = confidence_errors(samples.read_sample(path), GroundTruthMatcher(stride_px=6))
+    found = by_confidence(samples.read_sample(path), GroundTruthMatcher(stride_px=6))
     for one in found[2:]:
         assert one.error.te_m < 0.005
         assert one.error.re_deg < 0.005

@@ -63,8 +63,8 @@ def position(truth: Rigid3 = TRUTH, off_m: tuple[float, float, float] = (3.0, -2
 # -- help and errors ---------------------------------------------------------
 
 HELP = [
-    ["sim"], ["run"], ["doctor"], ["replay"], ["localize"], ["bench"], ["models", "build"], ["models", "list"],
-    ["tiles", "build"], ["tiles", "info"], ["tiles", "verify"], ["samples", "make"], ["samples", "simulate"],
+    ["sim"], ["run"], ["doctor"], ["replay"], ["localize"], ["bench"], ["bench-replay"], ["models", "build"],
+    ["models", "list"], ["tiles", "build"], ["tiles", "info"], ["tiles", "verify"], ["samples", "make"], ["samples", "simulate"],
     ["samples", "draw"],
 ]  # fmt: skip
 # Their only arguments are required, or there are none.
@@ -122,8 +122,8 @@ NUMBERS = [
     ("sim --duration nan", "finite"),
     ("sim --duration inf", "finite"),
     ("sim --duration 0", "above zero"),
-    ("bench x --seeds 0", "seeds"),
-    ("bench x --seeds=-3", "seeds"),
+    ("bench-replay x --seeds 0", "seeds"),
+    ("bench-replay x --seeds=-3", "seeds"),
     ("bench x --working-px 0", "working-px"),
     ("localize x --pack y --position nan,2,3", "finite"),
     ("localize x --pack y --position 1,2", "three numbers"),
@@ -237,6 +237,7 @@ def test_missing_files_are_named(
         (EXIT_FAILED, ["tiles", "verify", gone]),
         (EXIT_FAILED, ["tiles", "build", "--dop", gone, "--dsm", gone, "--out", tmp_path / "out"]),
         (EXIT_FAILED, ["bench", gone]),
+        (EXIT_FAILED, ["bench-replay", gone]),
     ]
     for code, arguments in cases:
         assert run(*arguments) == code, arguments
@@ -472,8 +473,8 @@ def sets(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return data
 
 
-def test_bench_goes_on_after_a_set_that_fails(sets: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    given = ["bench", sets, "--matchers", "sift", "--priors", "odometer", "--adhop", "off", "--seeds", "2"]
+def test_bench_replay_goes_on_after_a_set_that_fails(sets: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = ["bench-replay", sets, "--matchers", "sift", "--priors", "odometer", "--adhop", "off", "--seeds", "2"]
     assert run(*given, "--json") == EXIT_FAILED
     told = capsys.readouterr()
     (line,) = told.out.splitlines()
@@ -485,9 +486,9 @@ def test_bench_goes_on_after_a_set_that_fails(sets: Path, capsys: pytest.Capture
     assert "2 of 3 sets failed: also, good samples" in told.err
 
 
-def test_bench_of_one_set_finds_its_samples_once(sets: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    given = ["bench", sets / "good", "--matchers", "sift", "--priors", "odometer", "--adhop", "off", "--seeds", "1"]
-    assert run(*given) == EXIT_FAILED
+def test_bench_replay_of_one_set_finds_its_samples_once(sets: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = ["--matchers", "sift", "--priors", "odometer", "--adhop", "off", "--seeds", "1"]
+    assert run("bench-replay", sets / "good", *given) == EXIT_FAILED
     told = capsys.readouterr()
     assert [line.split(" | ")[0] for line in told.out.splitlines()[2:]] == ["| good"]
     assert "1 of 2 sets failed: good samples" in told.err
@@ -582,12 +583,35 @@ def test_samples_are_made_of_a_flight_then_studied_and_drawn(
     assert told.out.split() == [str(made)]
     assert "short_R0001: 0 % of the photo shows the map" in told.err
 
-    assert run("bench", samples / "out", "--study", "confidence", "--splits", "val", "--json") == 0
-    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [(row["kind"], row["above"]) for row in rows] == [("R", 0.0), ("R", 0.5), ("R", 0.95), ("R", 0.99)]
-    assert rows[2]["errors"]["samples"] == 1
-    assert rows[2]["errors"]["te_m"]["median"] < 0.005
-    assert rows[2]["errors"]["re_deg"]["median"] < 0.005
+    truth = ["bench", samples / "out", "--matcher", "ground-truth", "--study", "confidence"]
+    assert run(*truth, "--split", "val", "--json") == 0
+    (piece,) = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert (piece["sample"], piece["kind"], piece["split"]) == ("val/short_R0000.npz", "R", "val")
+    assert sorted(one["condition"]["min_confidence"] for one in piece["results"]) == [0.0, 0.5, 0.95, 0.99]
+    for one in piece["results"]:
+        if one["condition"]["min_confidence"] > 0.9:
+            assert one["te_m"] < 0.005
+            assert one["re_deg"] < 0.005
+
+    report = tmp_path / "report"
+    compared = ["bench", samples / "out", "--matcher", "orb", "--task", "localize,calibrate", "--study", "domain"]
+    assert run(*compared, "--turns", "2", "--out", report) == 0
+    told = capsys.readouterr().out
+    assert "### Localize: all samples" in told
+    assert "### What AdHoP changes: calibrate" in told
+    for name in ("localize", "calibrate", "adhop_localize", "domain_calibrate"):
+        for ending in (".md", ".csv", ".tex"):
+            assert (report / "tables" / f"{name}{ending}").stat().st_size > 0
+    assert (report / "tables" / "domain_localize.png").stat().st_size > 0
+    page = (report / "report.html").read_text("utf-8")
+    assert page.count("data:image/jpeg") >= 2
+    written = (report / "results.jsonl").read_bytes()
+    # All is there: nothing is measured again.
+    assert run(*compared, "--turns", "2", "--out", report) == 0
+    assert capsys.readouterr().out == told
+    assert (report / "results.jsonl").read_bytes() == written
+    assert run(*compared, "--out", report) == EXIT_CONFIG
+    assert "another --out" in capsys.readouterr().err
 
     assert run("samples", "draw", samples / "out", tmp_path) == 0
     assert cv2.imread(str(tmp_path / "short_R0000.png")).shape[1] == 1920
@@ -595,18 +619,17 @@ def test_samples_are_made_of_a_flight_then_studied_and_drawn(
     # A sample that can't be read is told, the table is of the others.
     (made.parent / "short_xDOP0000.npz").write_bytes(b"no archive")
     capsys.readouterr()
-    assert run("bench", samples / "out", "--study", "confidence") == EXIT_FAILED
+    assert run(*truth) == EXIT_FAILED
     told = capsys.readouterr()
-    assert "| R | 1 | > 0.95 |" in told.out
+    assert "| ground-truth | off | R | 0.95 |" in told.out
     assert "short_xDOP0000.npz: not a readable" in told.err
-    assert "1 of 2 samples failed" in told.err
+    assert "1 of 2 pieces of work failed" in told.err
 
 
 @pytest.mark.parametrize(
     ("arguments", "words", "code"),
     [
         (["bench", "nowhere", "--study", "confidence"], "nowhere: no .npz file", EXIT_FAILED),
-        (["bench", "nowhere", "--kinds", "R"], "name one with --study", EXIT_CONFIG),
         (["samples", "draw", "nowhere", "out"], "nowhere: no .npz file", EXIT_FAILED),
         (["samples", "make", PACK, "nowhere", "out"], "0 files named", EXIT_FAILED),
     ],
