@@ -1,7 +1,7 @@
 """Benchmark sets across domains: ``python -m ortholoc_sim.crossdomain OUT --kind xDOP --photos 200 --seed 1``.
 
 A map (DOP, DSM) of a generated place at one time and photos of it with their true poses, written as a folder that
-`ortholoc-edge bench` takes (docs/sequences.md). What lies between the map and the photos is the kind, named as in the
+`ortholoc-edge bench-replay` takes (docs/sequences.md). What lies between the map and the photos is the kind, named as in the
 OrthoLoC paper:
 
     same     the photos show the world of the map; only the sensors differ
