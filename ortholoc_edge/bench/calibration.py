@@ -28,6 +28,9 @@ from ortholoc_edge.pose.calibrate import Known, View
 from ortholoc_edge.tiles.lattice import Bounds
 from ortholoc_edge.tiles.store import MapStore
 
+# Relative difference of recorded focal lengths within which photos are of one camera: what autofocus does is less.
+_SAME_FOCAL = 0.02
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Photo:
@@ -104,11 +107,13 @@ def match(
     Args:
         focal_px: None: the long side of the image, as in the paper.
         seed: of the errors of what is known beside.
-    Raises: ConfigError for a photo of another size than the first, whose camera can't be the same.
+    Raises: ConfigError for a photo of another size than the first, or of another recorded camera: one of them is not
+        what the answer would be of.
     """
     random = np.random.default_rng([seed, 1])
     options = LocalizerOptions(adhop=adhop, calibrate=True)
     size: tuple[int, int] | None = None
+    recorded: tuple[str, Camera] | None = None
     for photo in photos:
         height, width = photo.image.shape[:2]
         size = size or (width, height)
@@ -117,6 +122,13 @@ def match(
                 f"{photo.name}: {width} x {height} px, the photos before it have {size[0]} x {size[1]}; calibrate one "
                 "camera at a time, with photos as it makes them"
             )
+        if photo.camera is not None:
+            recorded = recorded or (photo.name, photo.camera)
+            if abs(photo.camera.focal_px / recorded[1].focal_px - 1.0) > _SAME_FOCAL:
+                raise ConfigError(
+                    f"{photo.name}: recorded with a focal length of {photo.camera.focal_px:.1f} px, {recorded[0]} with "
+                    f"{recorded[1].focal_px:.1f}; calibrate one camera at a time"
+                )
         localizer = Localizer(start_camera(size, focal_px), photo.store, matcher, options)
         try:
             found = localizer.matched(Frame(0, photo.image, photo.name), RegionPrior(photo.bounds))

@@ -11,16 +11,18 @@ import pytest
 from made_samples import CAMERA, POSE, SMALL, by_confidence, made, photo
 from replay import rendered
 
+from ortholoc_edge.bench import calibration
 from ortholoc_edge.bench.evaluation import localize, sample_error
 from ortholoc_edge.bench.ground_truth import GroundTruthMatcher, geometric_confidence, true_map_px
 from ortholoc_edge.bench.sample_maker import PackScenery
 from ortholoc_edge.bench.sample_sheet import sample_sheet
 from ortholoc_edge.bench.samples import Sample, read_sample, write_sample
-from ortholoc_edge.errors import DatasetError
+from ortholoc_edge.errors import ConfigError, DatasetError
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.grid import bilinear
 from ortholoc_edge.geometry.rigid import Rigid3
+from ortholoc_edge.matching.sift import SiftMatcher
 from ortholoc_edge.matching.types import Matches
 from ortholoc_edge.tiles.lattice import Bounds
 from ortholoc_edge.tiles.window import MapLayers
@@ -317,3 +319,20 @@ def test_a_sheet_has_six_panels(sample: Sample) -> None:
             assert panel.std() > 15.0
     with pytest.raises(DatasetError, match="keypoints"):
         sample_sheet(replace(sample, keypoints=None))
+
+
+def test_photos_of_two_cameras_are_not_calibrated_as_one(sample: Sample, tmp_path: Path) -> None:
+    """Silently mixed they gave the focal length of neither."""
+    longer = replace(sample, name="D01_R0001", camera=replace(CAMERA, fx=300.0, fy=300.0))
+    paths = [write_sample(one, tmp_path) for one in (sample, longer)]
+    matched = calibration.match(
+        calibration.sample_photos(paths, None),
+        SiftMatcher(working_px=320, max_keypoints=300),
+        None,
+        adhop=False,
+        known=calibration.KnownBeside(),
+        seed=0,
+    )
+    assert next(matched).camera == CAMERA
+    with pytest.raises(ConfigError, match=r"D01_R0001: recorded with .* 300\.0 px, D01_R0000 with 270\.0; .*one camera"):
+        next(matched)
