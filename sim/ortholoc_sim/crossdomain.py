@@ -1,8 +1,8 @@
 """Benchmark sets across domains: ``python -m ortholoc_sim.crossdomain OUT --kind xDOP --photos 200 --seed 1``.
 
 A map (DOP, DSM) of a generated place at one time and photos of it with their true poses, written as a folder that
-`ortholoc-edge bench-replay` takes (docs/sequences.md). What lies between the map and the photos is the kind, named as in the
-OrthoLoC paper:
+`ortholoc-edge bench-replay` takes (docs/sequences.md). What lies between the map and the photos is the kind, named as
+in the OrthoLoC paper:
 
     same     the photos show the world of the map; only the sensors differ
     xDOP     the DOP shows another season and hour (crops, leaves, grass, cast shadows), other roofs, cars and trees, by

@@ -334,5 +334,5 @@ def test_photos_of_two_cameras_are_not_calibrated_as_one(sample: Sample, tmp_pat
         seed=0,
     )
     assert next(matched).camera == CAMERA
-    with pytest.raises(ConfigError, match=r"D01_R0001: recorded with .* 300\.0 px, D01_R0000 with 270\.0; .*one camera"):
+    with pytest.raises(ConfigError, match=r"R0001: recorded with .* 300\.0 px, D01_R0000 with 270\.0; .*one camera"):
         next(matched)
