@@ -153,13 +153,13 @@ def normalised(grey: ImageArray, usable: BoolArray | None) -> Float32Array:
     return np.asarray(cv2.LUT(grey, table), dtype=np.float32)
 
 
-def working_size(shape: tuple[int, ...], working_px: int) -> tuple[int, int]:
-    """(width, height), multiples of 32, nearest to the aspect of ``shape`` (rows, columns)."""
+def working_size(shape: tuple[int, ...], working_px: int, multiple_px: int = MULTIPLE_PX) -> tuple[int, int]:
+    """(width, height), multiples of ``multiple_px``, nearest to the aspect of ``shape`` (rows, columns)."""
     rows, columns = shape[:2]
     longest = max(rows, columns, 1)
 
     def side(pixels: int) -> int:
-        return max(MULTIPLE_PX, round(pixels * working_px / longest / MULTIPLE_PX) * MULTIPLE_PX)
+        return max(multiple_px, round(pixels * working_px / longest / multiple_px) * multiple_px)
 
     return side(columns), side(rows)
 
