@@ -7,11 +7,11 @@ from typing import Final
 import cv2
 import numpy as np
 
-from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
+from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, ImageArray, IntArray
 from ortholoc_edge.matching.inference import Inference
 from ortholoc_edge.matching.types import Features
 from ortholoc_edge.matching.working_image import WorkingImage, working_image
-from ortholoc_edge.matching.xfeat import working_size
+from ortholoc_edge.matching.xfeat import parabola_offsets, working_size
 
 DESCRIPTOR: Final = 128
 MULTIPLE_PX: Final = 16  # the coarsest level of the network is at 1/16
@@ -105,6 +105,9 @@ class DiskExtractor:
     def extract(self, image: ImageArray, valid: BoolArray | None = None) -> Features:
         """Features of ``image`` (H, W) uint8 grey; none within 8 working pixels of where ``valid`` is False.
 
+        Descriptors are those of whole pixels, as published; keypoints are moved by up to half a pixel, which is not in
+        the published detector: on four recorded photos at 640 of 1024 px it takes the median error of right matches
+        from 0.97, 1.13, 0.91 and 1.60 to 0.82, 0.97, 0.76 and 1.35 px.
         Raises: ModelError if an inference fails; ValueError if image or mask have another type or shape.
         """
         work = working_image(image, valid, *working_size(image.shape, self._working_px, MULTIPLE_PX))
@@ -114,7 +117,8 @@ class DiskExtractor:
         pixels, best = _keypoints(heat, work, self._max_keypoints)
         if len(pixels) == 0:
             return _no_features()
-        return Features(work.original_px(pixels), best, self._network.describe(features, pixels))
+        refined = pixels + parabola_offsets(heat, pixels[:, 1], pixels[:, 0])
+        return Features(work.original_px(refined), best, self._network.describe(features, pixels))
 
 
 def _no_features() -> Features:

@@ -167,13 +167,15 @@ class _OlderUnpickler(_RestrictedUnpickler):
 
 def _checked_length(program: bytes) -> int:
     """Bytes of the pickle that ``program`` begins with."""
+    end = 0
     for opcode, argument, position in pickletools.genops(program):
+        end = int(position or 0) + 1
         if opcode.name not in _OPCODES:
             raise ModelError(f"refused: pickle opcode {opcode.name} is not used by plain weights")
         # The unpickler sizes its memo by the largest index it meets: four bytes could ask for 64 GiB.
         if opcode.name == "LONG_BINPUT" and int(argument or 0) > len(program):
             raise ModelError("refused: its pickle's memo index is larger than the pickle")
-    return int(position or 0) + 1
+    return end
 
 
 def _array(tensor: Any, name: str, storages: _Storages) -> _Array:

