@@ -16,6 +16,7 @@ import math
 import pickle
 import pickletools
 import struct
+import warnings
 import zipfile
 import zlib
 from collections import OrderedDict
@@ -168,13 +169,15 @@ class _OlderUnpickler(_RestrictedUnpickler):
 def _checked_length(program: bytes) -> int:
     """Bytes of the pickle that ``program`` begins with."""
     end = 0
-    for opcode, argument, position in pickletools.genops(program):
-        end = int(position or 0) + 1
-        if opcode.name not in _OPCODES:
-            raise ModelError(f"refused: pickle opcode {opcode.name} is not used by plain weights")
-        # The unpickler sizes its memo by the largest index it meets: four bytes could ask for 64 GiB.
-        if opcode.name == "LONG_BINPUT" and int(argument or 0) > len(program):
-            raise ModelError("refused: its pickle's memo index is larger than the pickle")
+    # `pickletools` decodes a name with a backslash by a deprecated way; no name on the list has one.
+    with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
+        for opcode, argument, position in pickletools.genops(program):
+            end = int(position or 0) + 1
+            if opcode.name not in _OPCODES:
+                raise ModelError(f"refused: pickle opcode {opcode.name} is not used by plain weights")
+            # The unpickler sizes its memo by the largest index it meets: four bytes could ask for 64 GiB.
+            if opcode.name == "LONG_BINPUT" and int(argument or 0) > len(program):
+                raise ModelError("refused: its pickle's memo index is larger than the pickle")
     return end
 
 

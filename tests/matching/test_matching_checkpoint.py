@@ -145,7 +145,7 @@ def test_a_pickle_that_runs_something_is_refused(tmp_path: Path, protocol: int) 
 
 @pytest.mark.parametrize(
     "name",
-    ["builtins\neval", "torch\nload", "collections\nnamedtuple", "torch._utils\n_rebuild_wrapper_subclass"],
+    ["builtins\neval", "torch\nload", "collections\nnamedtuple", "torch._utils\n_rebuild_wrapper_subclass", "a\\o\nb"],
 )
 def test_a_name_off_the_list_is_refused(name: str) -> None:
     program = b"\x80\x02c" + name.encode() + b"\n)R."
