@@ -10,6 +10,7 @@ import numpy as np
 
 from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
 from ortholoc_edge.matching.aliked import AlikedExtractor
+from ortholoc_edge.matching.disk import DiskExtractor
 from ortholoc_edge.matching.inference import Inference
 from ortholoc_edge.matching.models import joint_sha256
 from ortholoc_edge.matching.types import Features, Matches
@@ -161,6 +162,31 @@ class AlikedLightGlueMatcher(GlueMatcher):
         )
         hashes = [picture[1], descriptors[1]]
         super().__init__("aliked-lightglue", aliked, hashes, network, working_px=working_px, threads=threads)
+
+
+class DiskLightGlueMatcher(GlueMatcher):
+    """DISK's features. Args and errors as of `LighterGlueMatcher`, working sides are multiples of 16; ``picture`` and
+    ``descriptors`` are DISK's."""
+
+    def __init__(
+        self,
+        picture: tuple[bytes, str],
+        descriptors: tuple[bytes, str],
+        network: tuple[bytes, str],
+        *,
+        working_px: int = 640,
+        max_keypoints: int = MOST_KEYPOINTS,
+        threads: int = 1,
+    ) -> None:
+        disk = DiskExtractor(
+            picture,
+            descriptors,
+            working_px=working_px,
+            max_keypoints=min(max_keypoints, MOST_KEYPOINTS),
+            threads=threads,
+        )
+        hashes = [picture[1], descriptors[1]]
+        super().__init__("disk-lightglue", disk, hashes, network, working_px=working_px, threads=threads)
 
 
 def _places(features: Features) -> Float32Array:

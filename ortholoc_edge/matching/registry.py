@@ -14,13 +14,13 @@ from ortholoc_edge.matching.types import STRUCTURAL, AnyMatcher, Matcher, Struct
 
 # Without weights; which of them OpenCV lacks, `binary.unavailable` says.
 BINARY: Final = ("orb", "akaze")
-MATCHERS: Final = ("xfeat", "xfeat-star", "xfeat-lighterglue", "aliked-lightglue", "sift", *BINARY)
+MATCHERS: Final = ("xfeat", "xfeat-star", "xfeat-lighterglue", "aliked-lightglue", "disk-lightglue", "sift", *BINARY)
 # Ways to match a frame with the map: those, structural matching, and structural matching with one of those for frames
 # that it can't place.
 METHODS: Final = (STRUCTURAL, *(f"{STRUCTURAL}+{name}" for name in MATCHERS), *MATCHERS)
 
 # Matchers that run several graphs.
-_PAIRED: Final = ("xfeat-star", "xfeat-lighterglue", "aliked-lightglue")
+_PAIRED: Final = ("xfeat-star", "xfeat-lighterglue", "aliked-lightglue", "disk-lightglue")
 
 
 def make_method(
@@ -115,7 +115,11 @@ def _paired(
     name: str, working_px: int, max_keypoints: int, threads: int, progress: models.Progress | None
 ) -> Matcher:
     # Late for the same reason.
-    from ortholoc_edge.matching.lighterglue import AlikedLightGlueMatcher, LighterGlueMatcher
+    from ortholoc_edge.matching.lighterglue import (
+        AlikedLightGlueMatcher,
+        DiskLightGlueMatcher,
+        LighterGlueMatcher,
+    )
     from ortholoc_edge.matching.xfeat_star import XFeatStarMatcher
 
     stored = [models.ensure(one, progress) for one in (name, *models.known(name).needs)]
@@ -124,5 +128,9 @@ def _paired(
         return XFeatStarMatcher(
             own, *needed, working_px=working_px, max_keypoints=max_keypoints, threads=threads
         )
-    kind: Callable[..., Matcher] = LighterGlueMatcher if name == "xfeat-lighterglue" else AlikedLightGlueMatcher
-    return kind(*needed, own, working_px=working_px, max_keypoints=max_keypoints, threads=threads)
+    kinds: dict[str, Callable[..., Matcher]] = {
+        "xfeat-lighterglue": LighterGlueMatcher,
+        "aliked-lightglue": AlikedLightGlueMatcher,
+        "disk-lightglue": DiskLightGlueMatcher,
+    }
+    return kinds[name](*needed, own, working_px=working_px, max_keypoints=max_keypoints, threads=threads)

