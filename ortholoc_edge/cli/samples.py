@@ -86,6 +86,10 @@ def _add_output(parser: argparse.ArgumentParser) -> None:
         "--split", type=Split, choices=list(Split), help="write to this folder of the data set's layout below OUT"
     )
     parser.add_argument("--seed", type=seed, default=1, help="of all that is drawn (default: %(default)s)")
+    parser.add_argument(
+        "--raster-px", type=positive_int, default=MakerOptions().raster_px,
+        help="side of orthophoto and surface model (default: %(default)s, the paper's)",
+    )  # fmt: skip
 
 
 def _location(text: str) -> str:
@@ -98,7 +102,7 @@ def _make(args: argparse.Namespace) -> int:
     recorded = sequence.read_flight(args.flight)
     location = args.location or re.sub(r"[^A-Za-z0-9-]+", "-", args.flight.resolve().name)
     folder = _folder(args)
-    options = MakerOptions(seed=args.seed)
+    options = MakerOptions(seed=args.seed, raster_px=args.raster_px)
     with (
         MapStore(Pack.open(args.pack), max_pixels=_MAX_PIXELS) as store,
         nullcontext(store)
@@ -128,7 +132,7 @@ def _simulate(args: argparse.Namespace) -> int:
     from ortholoc_sim.samples import KINDS, simulated_samples
 
     location = args.location or f"S{args.seed:02d}"
-    options = MakerOptions(seed=args.seed)
+    options = MakerOptions(seed=args.seed, raster_px=args.raster_px)
     folder = _folder(args)
     place = CrossDomain(Kind.SAME, args.seed, *(round(side) for side in args.place))
     failed = 0
