@@ -12,7 +12,7 @@ import functools
 import hashlib
 import os
 import traceback
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -370,7 +370,3 @@ def run(plan: Plan, store: Store, workers: Workers) -> Iterator[tuple[int, int, 
         else:
             store.write(found)
             yield done, len(jobs), None
-
-
-def failed_samples(failures: Collection[Failure]) -> list[str]:
-    return sorted({failure.sample for failure in failures})
