@@ -13,7 +13,6 @@ import numpy.typing as npt
 import onnx
 import onnxruntime as ort
 import torch
-from torch.onnx import symbolic_helper
 
 from ortholoc_edge.errors import ModelError
 from ortholoc_edge.matching.exported import MOST_INLINE_BYTES
@@ -127,8 +126,8 @@ def write_graph(graph: TorchGraph, path: Path, source: str) -> dict[str, float]:
     # The exporter restores `training` from the outermost module.
     module = graph.module.eval()
     published = [np.asarray(values) for values in graph.published()]
-    symbolic_helper._set_opset_version(OPSET) if hasattr(symbolic_helper, "_set_opset_version") else None
-    torch.onnx.register_custom_op_symbolic("aten::linalg_inv", _inverse, OPSET)
+    for name, symbolic in _MISSING.items():
+        torch.onnx.register_custom_op_symbolic(name, symbolic, OPSET)
     try:
         with warnings.catch_warnings(), torch.no_grad():
             # What is traced depends on sizes that are fixed here; each such place warns.
@@ -146,7 +145,8 @@ def write_graph(graph: TorchGraph, path: Path, source: str) -> dict[str, float]:
     except (RuntimeError, torch.onnx.errors.OnnxExporterError) as err:
         raise ModelError(f"torch {torch.__version__} can't export the network ({err}); try the tested version") from err
     finally:
-        torch.onnx.unregister_custom_op_symbolic("aten::linalg_inv", OPSET)
+        for name in _MISSING:
+            torch.onnx.unregister_custom_op_symbolic(name, OPSET)
     _sealed(path, source)
     options = ort.SessionOptions()
     options.log_severity_level = 4
@@ -166,6 +166,15 @@ def write_graph(graph: TorchGraph, path: Path, source: str) -> dict[str, float]:
 def _inverse(g: Any, value: Any) -> Any:
     # ONNX itself has no inverse; ONNX Runtime does.
     return g.op("com.microsoft::Inverse", value).setType(value.type())
+
+
+def _expm1(g: Any, value: Any) -> Any:
+    one = g.op("Constant", value_t=torch.tensor(1.0))
+    return g.op("Sub", g.op("Exp", value), one)
+
+
+# What the exporter lacks.
+_MISSING: Final = {"aten::linalg_inv": _inverse, "aten::expm1": _expm1}
 
 
 def _sealed(path: Path, source: str) -> None:
