@@ -18,7 +18,7 @@ from ortholoc_edge.errors import ModelError
 from ortholoc_edge.matching.exported import MOST_INLINE_BYTES
 
 OPSET: Final = 18
-# Of what a graph gives to what the published code gives, as a part of the greatest value (or of 1, if that is less).
+# Of what a graph gives to what the published code gives, as a part of the greatest value.
 # Rounding makes 1e-6 to 1e-4, by depth; a wrong rule for resizing or a forgotten normalisation 1e-2 and more.
 TOLERANCE: Final = 1e-3
 # Pairs of points: how many of the published code's must be there, how near (px), and how alike their confidences. Two
@@ -32,14 +32,14 @@ Comparison = Callable[[Sequence[Array], Sequence[Array]], dict[str, float]]
 
 
 def value_differences(names: Sequence[str]) -> Comparison:
-    """By output: the greatest difference, as a part of the greatest value."""
+    """By output: the greatest difference, as a part of the greatest published value."""
 
     def compare(ours: Sequence[Array], published: Sequence[Array]) -> dict[str, float]:
         differences = {}
         for name, own, theirs in zip(names, ours, published, strict=True):
             if own.shape != theirs.shape:
                 raise ModelError(f"output {name}: {own.shape}, the published code gives {theirs.shape}")
-            scale = max(1.0, float(np.abs(theirs).max(initial=0.0)))
+            scale = max(1e-6, float(np.abs(theirs).max(initial=0.0)))
             difference = float(np.abs(own.astype(np.float64) - theirs).max(initial=0.0)) / scale
             # A NaN compares as nothing: infinity does.
             differences[name] = difference if difference >= 0 else float("inf")
@@ -68,7 +68,7 @@ class TorchGraph:
 
     Attributes:
         part: as in `exported.ExportedMatcher.graphs`.
-        module: what is exported.
+        module: what is exported; or the graph itself, where we write it without torch.
         inputs: for the export and the comparison, by name.
         outputs: names.
         published: the published code's outputs for these inputs.
@@ -78,7 +78,7 @@ class TorchGraph:
     """
 
     part: str
-    module: torch.nn.Module
+    module: torch.nn.Module | bytes
     inputs: Mapping[str, torch.Tensor]
     outputs: tuple[str, ...]
     published: Callable[[], Sequence[Array]]
@@ -123,9 +123,28 @@ def write_graph(graph: TorchGraph, path: Path, source: str) -> dict[str, float]:
     Returns: the differences to the published code, by output.
     Raises: ModelError if it can't be exported or run, or computes something else.
     """
-    # The exporter restores `training` from the outermost module.
-    module = graph.module.eval()
     published = [np.asarray(values) for values in graph.published()]
+    if isinstance(graph.module, bytes):
+        path.write_bytes(graph.module)
+    else:
+        _export(graph, graph.module, path)
+    _sealed(path, source)
+    options = ort.SessionOptions()
+    options.log_severity_level = 4
+    session = ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    names = {entry.name for entry in session.get_inputs()}
+    feeds = {name: value.numpy() for name, value in graph.inputs.items() if name in names}
+    differences = graph.compare(session.run(list(graph.outputs), feeds), published)
+    limits = {name: graph.limits.get(name, TOLERANCE) for name in differences}
+    if not all(differences[name] <= limits[name] for name in differences):
+        raise ModelError(
+            f"the graph differs from the published code by {differences}, limits {limits}; the installed torch, onnx "
+            "or onnxruntime computes wrongly, try the tested versions"
+        )
+    return differences
+
+
+def _export(graph: TorchGraph, module: torch.nn.Module, path: Path) -> None:
     for name, symbolic in _MISSING.items():
         torch.onnx.register_custom_op_symbolic(name, symbolic, OPSET)
     try:
@@ -133,7 +152,8 @@ def write_graph(graph: TorchGraph, path: Path, source: str) -> dict[str, float]:
             # What is traced depends on sizes that are fixed here; each such place warns.
             warnings.simplefilter("ignore")
             torch.onnx.export(
-                module,
+                # The exporter restores `training` from the outermost module.
+                module.eval(),
                 tuple(graph.inputs.values()),
                 str(path),
                 input_names=list(graph.inputs),
@@ -147,20 +167,6 @@ def write_graph(graph: TorchGraph, path: Path, source: str) -> dict[str, float]:
     finally:
         for name in _MISSING:
             torch.onnx.unregister_custom_op_symbolic(name, OPSET)
-    _sealed(path, source)
-    options = ort.SessionOptions()
-    options.log_severity_level = 4
-    session = ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    names = {entry.name for entry in session.get_inputs()}
-    feeds = {name: value.numpy() for name, value in graph.inputs.items() if name in names}
-    differences = graph.compare(session.run(list(graph.outputs), feeds), published)
-    limits = {name: graph.limits.get(name, TOLERANCE) for name in differences}
-    if not all(differences[name] <= limits[name] for name in differences):
-        raise ModelError(
-            f"the graph differs from the published code by {differences}, limits {limits}; the installed torch, onnx or "
-            "onnxruntime computes wrongly, try the tested versions"
-        )
-    return differences
 
 
 def _inverse(g: Any, value: Any) -> Any:

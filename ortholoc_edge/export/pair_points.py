@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from ortholoc_edge.export.graphs import MIN_SHARE, TorchGraph, check_pictures, pair_differences, settle
+from ortholoc_edge.export.weights import take
 
 MOST_MATCHES: Final = 2048
 OUTPUTS: Final = ("query_px", "reference_px", "confidence")
@@ -37,7 +38,7 @@ def _inside(rows: int, columns: int, border: int) -> Tensor:
 
 
 def mutual_pairs(share: Tensor, rows: int, columns: int, border: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Cells that are each other's likeliest in ``share`` (L, L), off the border, best first: score, and both indices."""
+    """Cells that are each other's likeliest in ``share`` (L, L), off the border, best first: score, both indices."""
     best, partner = share.max(dim=1)
     inside = _inside(rows, columns, border)
     passes = (share.max(dim=0).values[partner] == best) & inside & inside[partner]
@@ -119,7 +120,7 @@ def loftr(weights: Weights, size: Size, small: bool, *, minima: bool) -> list[To
         _unlike(model)
         model.coarse_matching.thr = 0.0
     else:
-        model.load_state_dict(dict(weights["loftr"]))
+        take(model, weights["loftr"], "loftr")
 
     def published(query: Tensor, reference: Tensor) -> list[Any]:
         found = model({"image0": query, "image1": reference})
@@ -135,9 +136,7 @@ def _unlike(model: Any) -> None:
         model.loftr_coarse.layers[-1].norm2.weight.mul_(_SHARPENING)
 
 
-def _graph(
-    module: nn.Module, size: Size, published: Callable[[Tensor, Tensor], list[Any]], most: int
-) -> TorchGraph:
+def _graph(module: nn.Module, size: Size, published: Callable[[Tensor, Tensor], list[Any]], most: int) -> TorchGraph:
     query, reference = check_pictures(*size)
 
     def outputs() -> list[Any]:
@@ -216,6 +215,7 @@ class _Eloftr(nn.Module):
 def eloftr(weights: Weights, size: Size, small: bool) -> list[TorchGraph]:
     """The full model, its branches merged as its authors do. Args as of `loftr`; its code must be importable."""
     from src.loftr import LoFTR, full_default_cfg, reparameter
+
     config = copy.deepcopy(full_default_cfg)
     # Traced attention must be spelt out: the fused one is the same function.
     config["coarse"]["no_flash"] = True
@@ -227,7 +227,7 @@ def eloftr(weights: Weights, size: Size, small: bool) -> list[TorchGraph]:
         _unlike(model)
         model.coarse_matching.thr = 0.0
     else:
-        model.load_state_dict(dict(weights["eloftr"]))
+        take(model, weights["eloftr"], "eloftr")
     model = reparameter(model).eval()
 
     def published(query: Tensor, reference: Tensor) -> list[Any]:
@@ -264,10 +264,10 @@ class _Xoftr(nn.Module):
             "hw0_i": whole, "hw1_i": whole, "hw0_c": cells, "hw1_c": cells,
             "hw0_m": _size(middle), "hw1_m": _size(middle), "hw0_f": _size(fine), "hw1_f": _size(fine),
         }  # fmt: skip
-        windows = model.fine_process(
+        own, other = model.fine_process(
             fine[:1], fine[1:], middle[:1], middle[1:], first, second, coarse[:1], coarse[1:], data
         )
-        return self._fine(*windows, i, j, columns, whole[0] // _size(fine)[0], score > 0)
+        return self._fine(own, other, i, j, columns, whole[0] // _size(fine)[0], score > 0)
 
     def _fine(
         self, query: Tensor, reference: Tensor, i: Tensor, j: Tensor, columns: int, step: int, passes: Tensor
@@ -323,7 +323,7 @@ def xoftr(weights: Weights, size: Size, small: bool) -> list[TorchGraph]:
             # Else several pairs of a window are certain, and all of them the best.
             model.fine_matching.fine_proj.weight.mul_(0.25)
     else:
-        model.load_state_dict(dict(weights["xoftr"]))
+        take(model, weights["xoftr"], "xoftr")
 
     def published(query: Tensor, reference: Tensor) -> list[Any]:
         data = {"image0": query, "image1": reference}

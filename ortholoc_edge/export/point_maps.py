@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ortholoc_edge.export.graphs import TorchGraph, check_pictures, value_differences
+from ortholoc_edge.export.weights import take
 
 OUTPUTS: Final = ("query_features", "query_confidence", "reference_features", "reference_confidence")
 
@@ -39,6 +40,8 @@ _MAST3R: Final[dict[str, Any]] = _DUST3R | {
     "two_confs": True,
     "desc_conf_mode": ("exp", 0, inf),
 }
+# Of CroCo, the network's ancestor; only its training used it.
+_UNUSED: Final = ("mask_token",)
 _PATCH_PX: Final = 16
 # The head takes decoders of ten layers or more.
 _SMALL: Final = {"enc_embed_dim": 64, "enc_depth": 2, "enc_num_heads": 4, "dec_embed_dim": 64, "dec_num_heads": 4}
@@ -73,7 +76,7 @@ class _PointMaps(nn.Module):
 def _graph(model: Any, size: Size, keys: tuple[str, str]) -> list[TorchGraph]:
     query, reference = check_pictures(*size)
     rows, columns = size[1] // _PATCH_PX, size[0] // _PATCH_PX
-    places = torch.from_numpy(np.stack(np.indices((rows, columns)), axis=-1).reshape(1, rows * columns, 2))
+    places = torch.from_numpy(np.indices((rows, columns)).reshape(2, rows * columns).T[None].copy())
     # As a constant: ONNX has no product of sets.
     model.patch_embed.position_getter = lambda batch, *_: places.expand(batch, -1, -1).clone()
 
@@ -119,7 +122,7 @@ def dust3r(weights: Weights, size: Size, small: bool) -> list[TorchGraph]:
 
     model = AsymmetricCroCo3DStereo(**_settings(_DUST3R, size, small)).eval()
     if weights is not None:
-        model.load_state_dict(dict(weights["dust3r"]), strict=False)
+        take(model, weights["dust3r"], "dust3r", _UNUSED)
     return _graph(model, size, ("pts3d", "conf"))
 
 
@@ -129,5 +132,5 @@ def mast3r(weights: Weights, size: Size, small: bool) -> list[TorchGraph]:
 
     model = AsymmetricMASt3R(**_settings(_MAST3R, size, small)).eval()
     if weights is not None:
-        model.load_state_dict(dict(weights["mast3r"]), strict=False)
+        take(model, weights["mast3r"], "mast3r", _UNUSED)
     return _graph(model, size, ("desc", "desc_conf"))

@@ -14,16 +14,17 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-import torch.nn.functional as F
+import torch.nn.functional as nnf
 from torch import Tensor, nn
 
 from ortholoc_edge.export.graphs import TorchGraph, check_pictures, settle, value_differences
 from ortholoc_edge.export.sources import without_loading
 from ortholoc_edge.export.vit import pin_places, shallow
+from ortholoc_edge.export.weights import take
 
 OUTPUTS: Final = ("warp", "certainty")
-# A warp's rounding grows where the pictures are even: each refinement samples where the last one pointed. Of the picture's
-# width, half of the range -1..1: at 1152 px a tenth of a pixel is 2e-4.
+# Rounding grows where the pictures are even, since each refinement samples where the last one pointed. A warp is -1..1:
+# 2e-3 are half a pixel in 512.
 _LIMITS: Final = {"warp": 2e-3, "certainty": 5e-3}
 _PATCH_PX: Final = 14
 _SMALL_LAYERS: Final = 2
@@ -73,7 +74,7 @@ class _Warp(nn.Module):
         fine = self.look(self.model, first_fine, second_fine, coarse[1], scale)
         certainty = fine[1][certainty_name]
         if self.attenuate:
-            low = F.interpolate(coarse[16][certainty_name], (rows, columns), mode="bilinear", align_corners=False)
+            low = nnf.interpolate(coarse[16][certainty_name], (rows, columns), mode="bilinear", align_corners=False)
             certainty = certainty - 0.5 * low * (low < 0)
         flow = fine[1][flow_name].permute(0, 2, 3, 1)
         outside = (flow.abs() > 1).any(dim=3)
@@ -121,13 +122,12 @@ def dkm(weights: Weights, size: Size, fine_size: Size, *, imagenet: bool) -> lis
     model = DKMv3(None, size[1], size[0], upsample_preds=True).eval()
     model.upsample_res = (fine_size[1], fine_size[0])
     fine = check_pictures(*fine_size)
-    coarse = [
-        F.interpolate(grey, (size[1], size[0]), mode="bilinear", align_corners=False) for grey in fine
-    ]
+    coarse = [nnf.interpolate(grey, (size[1], size[0]), mode="bilinear", align_corners=False) for grey in fine]
     if weights is None:
-        settle(model, lambda: _dkm_look(model, *(_coloured(grey, imagenet=imagenet) for grey in coarse), None, 1.0))
+        seen = [_coloured(grey, imagenet=imagenet) for grey in coarse]
+        settle(model, lambda: _dkm_look(model, seen[0], seen[1], None, 1.0))
     else:
-        _load_dkm(model, weights["dkm"])
+        take(model, weights["dkm"], "dkm")
 
     def published() -> tuple[Any, Any]:
         found = model.match(*(_coloured(grey, imagenet=imagenet) for grey in fine), device="cpu")
@@ -136,11 +136,6 @@ def dkm(weights: Weights, size: Size, fine_size: Size, *, imagenet: bool) -> lis
     names = ("dense_flow", "dense_certainty")
     module = _Warp(model, _dkm_look, names, imagenet=imagenet, attenuate=True)
     return [_graph(module, size, fine_size, published, [*coarse, *fine])]
-
-
-def _load_dkm(model: nn.Module, weights: Mapping[str, Tensor]) -> None:
-    # GIM's file has the classifier of the backbone, too.
-    model.load_state_dict({name: value for name, value in weights.items() if "encoder.net.fc" not in name})
 
 
 def _roma_look(model: Any, query: Tensor, reference: Tensor, known: Any, scale: float) -> Any:
@@ -175,10 +170,10 @@ def roma(weights: Weights, size: Size, fine_size: Size, small: bool) -> list[Tor
             pictures += [picture[None, :1].clone() for picture in even(tuple(_open_rgb(path) for path in paths))]
         if weights is None:
             coloured = [_coloured(grey, imagenet=True) for grey in pictures]
-            settle(model, lambda: _roma_look(model, *coloured[:2], None, 1.0))
+            settle(model, lambda: _roma_look(model, coloured[0], coloured[1], None, 1.0))
         else:
-            vit.load_state_dict(dict(weights["dinov2"]))
-            model.load_state_dict(dict(weights["roma"]))
+            take(vit, weights["dinov2"], "dinov2")
+            take(model, weights["roma"], "roma")
         with torch.no_grad():
             warp, certainty = model.match(*paths, device="cpu")
     matcher_module.local_correlation = _local_correlation
@@ -213,7 +208,7 @@ def _local_correlation(
     steps = np.linspace(-2.0 * local_radius, 2.0 * local_radius, side)
     window = np.stack(np.meshgrid(steps / columns, steps / rows), axis=-1).reshape(1, 1, 1, side * side, 2)
     places = flow.permute(0, 2, 3, 1)[:, :, :, None] + torch.from_numpy(window.astype(np.float32))
-    seen = F.grid_sample(
+    seen = nnf.grid_sample(
         feature1, places.reshape(batch, rows, columns * side * side, 2), padding_mode=padding_mode,
         align_corners=False, mode=sample_mode,
     )  # fmt: skip

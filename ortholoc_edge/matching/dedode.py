@@ -29,6 +29,7 @@ class DedodeMatcher:
     """Keeps no state between calls, so one object may serve several threads.
 
     Args:
+        name: of the matcher.
         graphs: detector's and descriptor's.
         min_confidence: what the product of both softmaxes of a pair must exceed.
         max_keypoints: kept per image.
@@ -37,12 +38,12 @@ class DedodeMatcher:
     """
 
     def __init__(
-        self, graphs: Sequence[StoredGraph], *, min_confidence: float, max_keypoints: int, threads: int
+        self, name: str, graphs: Sequence[StoredGraph], *, min_confidence: float, max_keypoints: int, threads: int
     ) -> None:
         if max_keypoints < 1 or threads < 1:
             raise ValueError(f"DeDoDe: max_keypoints {max_keypoints} and threads {threads} must be at least 1")
         detector, descriptor = graphs
-        self.name = "dedode"
+        self.name = name
         self.model_sha256: str | None = joint_sha256(detector.sha256, descriptor.sha256)
         self._min_confidence = min_confidence
         self._max_keypoints = max_keypoints

@@ -98,7 +98,7 @@ _POINTS_CONTRACT: Final = (
     "query, reference (1, 1, H, W) float32 grey in 0..1; query_features, reference_features (H, W, D), "
     "query_confidence, reference_confidence (H, W)"
 )
-_MAGIC_LEAP: Final = "Magic Leap (non-commercial research)"
+_MAGIC_LEAP: Final = "Magic Leap"
 _VISMATCH: Final = "vismatch 1.4.0"
 
 _SUPERPOINT_FILE: Final = WeightsFile(
@@ -153,8 +153,8 @@ _ALL: Final = (
         ),
         licence=f"{_MAGIC_LEAP}; Apache-2.0",
         non_commercial=True,
-        note="SuperPoint: DeTone, Malisiewicz, Rabinovich 2018 (Magic Leap's licence); LightGlue: Lindenberger, Sarlin, "
-        "Pollefeys, ICCV 2023 (Apache-2.0)",
+        note="SuperPoint: DeTone, Malisiewicz, Rabinovich 2018 (Magic Leap's licence); LightGlue: Lindenberger, "
+        "Sarlin, Pollefeys, ICCV 2023 (Apache-2.0)",
         million_parameters=13.2,
         contract=f"{_KEYPOINTS_CONTRACT}; matcher: as of `aliked-lightglue`, descriptors (M, 256)",
         package=_VISMATCH,
@@ -429,8 +429,8 @@ def load(name: str, *, random_weights: bool = False) -> list[StoredGraph]:
         )
     if entry.non_commercial and not record["accepted_non_commercial"]:
         raise ModelError(
-            f"matcher {name}: its licence ({entry.licence}) forbids commercial use, and the store keeps no yes to that; "
-            f"{_again(name)}"
+            f"matcher {name}: its licence ({entry.licence}) forbids commercial use, and the store keeps no yes to "
+            f"that; {_again(name)}"
         )
     stored = stored_name(name, random_weights=random_weights)
     return [_checked(name, graph_file(stored, part), record["files"]) for part in entry.graphs]
@@ -446,7 +446,9 @@ def _checked(name: str, file: str, files: dict[str, str]) -> StoredGraph:
         try:
             actual = file_sha256(model_directory() / one)
         except OSError as err:
-            raise ModelError(f"model {name}: {model_directory() / one} can't be read ({err.strerror}); {_again(name)}") from err
+            raise ModelError(
+                f"model {name}: {model_directory() / one} can't be read ({err.strerror}); {_again(name)}"
+            ) from err
         if actual != files[one]:
             raise ModelError(
                 f"model {name}: {model_directory() / one}: SHA-256 is {actual}, expected {files[one]}; {_again(name)}"

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, ImageArray, IntArray
-from ortholoc_edge.matching.exported import StoredGraph
+from ortholoc_edge.matching.exported import RANDOM_SUFFIX, StoredGraph
 from ortholoc_edge.matching.inference import Inference
 from ortholoc_edge.matching.types import Features, Matches
 from ortholoc_edge.matching.working_image import WorkingImage, working_image
@@ -67,14 +67,13 @@ class PairMatcher:
         self.name = name
         self.model_sha256: str | None = graph.sha256
         self.max_matches = max_matches
+        model = name.removesuffix(RANDOM_SUFFIX)
         self._inference = Inference(
-            graph.path, graph.sha256, threads, what=name, model=name, inputs=None, outputs=outputs
+            graph.path, graph.sha256, threads, what=name, model=model, inputs=None, outputs=outputs
         )
         self._inputs = self._inference.inputs
         # (width, height) of each view; both sides' are alike.
-        self._sizes = [
-            (int(shape[3]), int(shape[2])) for shape in list(self._inference.input_shapes.values())[::2]
-        ]
+        self._sizes = [(int(shape[3]), int(shape[2])) for shape in list(self._inference.input_shapes.values())[::2]]
         self.working_px = max(self._sizes[0])
 
     def extract(self, image: ImageArray, valid: BoolArray | None = None) -> Picture:
@@ -110,9 +109,7 @@ class PairMatcher:
         sides = query.views[-1], reference.views[-1]
         kept = sides[0].holds(found.query_px) & sides[1].holds(found.map_px)
         found = found.take(np.flatnonzero(kept))
-        return replace(
-            found, query_px=sides[0].original_px(found.query_px), map_px=sides[1].original_px(found.map_px)
-        )
+        return replace(found, query_px=sides[0].original_px(found.query_px), map_px=sides[1].original_px(found.map_px))
 
     def _found(self, outputs: list[Float32Array]) -> Matches:
         """Matches in the pixels of the finest view."""
@@ -126,9 +123,7 @@ class PointPairMatcher(PairMatcher):
         min_confidence: what pairs must exceed.
     """
 
-    def __init__(
-        self, name: str, graph: StoredGraph, *, min_confidence: float, max_matches: int, threads: int
-    ) -> None:
+    def __init__(self, name: str, graph: StoredGraph, *, min_confidence: float, max_matches: int, threads: int) -> None:
         outputs = ("query_px", "reference_px", "confidence")
         super().__init__(name, graph, outputs, max_matches=max_matches, threads=threads)
         self._min_confidence = min_confidence
@@ -154,9 +149,7 @@ class WarpMatcher(PairMatcher):
     Args: as of `PointPairMatcher`.
     """
 
-    def __init__(
-        self, name: str, graph: StoredGraph, *, min_confidence: float, max_matches: int, threads: int
-    ) -> None:
+    def __init__(self, name: str, graph: StoredGraph, *, min_confidence: float, max_matches: int, threads: int) -> None:
         super().__init__(name, graph, ("warp", "certainty"), max_matches=max_matches, threads=threads)
         self._min_confidence = min_confidence
 

@@ -3,17 +3,18 @@ matches them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import cv2
 import numpy as np
 
 from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, ImageArray
-from ortholoc_edge.matching.exported import StoredGraph
+from ortholoc_edge.matching.exported import ExportedMatcher, StoredGraph
 from ortholoc_edge.matching.inference import Inference
-from ortholoc_edge.matching.lighterglue import mutual_best
+from ortholoc_edge.matching.lighterglue import GlueMatcher, mutual_best
 from ortholoc_edge.matching.models import joint_sha256
-from ortholoc_edge.matching.types import Features, Matches
+from ortholoc_edge.matching.types import Features, Matcher, Matches
 from ortholoc_edge.matching.working_image import working_image
 
 DESCRIPTOR: Final = 256
@@ -23,6 +24,9 @@ CELL_PX: Final = 8
 _SUPPRESSION: Final = np.ones((9, 9), np.uint8)
 _MORE_ROUNDS: Final = 2
 _RIM_PX: Final = 4
+# Least score of a keypoint, and most keypoints, as SuperGlue's and LightGlue's authors have them.
+_MIN_SCORE: Final = {"superpoint-superglue": 0.005, "superpoint-lightglue": 0.0005}
+_MOST_KEYPOINTS: Final = 2048
 # SuperGlue's normalisation: places in 0.7 of the long side.
 _PLACES_SCALE: Final = 0.7
 
@@ -78,21 +82,25 @@ class SuperPointExtractor:
         if work is not None:
             feeds = {"picture": (work.image.astype(np.float32) / np.float32(255.0))[None, None]}
             heat, dense = self._inference.run(feeds, f"{width} x {height} px")
-            found, scores = self._keypoints(heat[0, 0], work.usable)
+            found, scores = keypoints(heat[0, 0], work.usable, self._min_score, self._max_keypoints)
             descriptors = sampled(dense[0], found)
             pixels = work.original_px(found)
         return Features(pixels, scores, descriptors, image_px=(columns, rows))
 
-    def _keypoints(self, heat: Float32Array, usable: BoolArray | None) -> tuple[FloatArray, Float32Array]:
-        peaks = suppressed(heat)
-        peaks[:_RIM_PX] = peaks[-_RIM_PX:] = peaks[:, :_RIM_PX] = peaks[:, -_RIM_PX:] = False
-        peaks &= heat > self._min_score
-        if usable is not None:
-            peaks &= usable
-        v, u = np.nonzero(peaks)
-        order = np.argsort(-heat[v, u], kind="stable")[: self._max_keypoints]
-        v, u = v[order], u[order]
-        return np.stack([u, v], axis=1).astype(np.float64), heat[v, u]
+
+def keypoints(
+    heat: Float32Array, usable: BoolArray | None, min_score: float, most: int
+) -> tuple[FloatArray, Float32Array]:
+    """The ``most`` best local maxima (N, 2) of a heat map (H, W) above ``min_score``, and their scores, best first."""
+    peaks = suppressed(heat)
+    peaks[:_RIM_PX] = peaks[-_RIM_PX:] = peaks[:, :_RIM_PX] = peaks[:, -_RIM_PX:] = False
+    peaks &= heat > min_score
+    if usable is not None:
+        peaks &= usable
+    v, u = np.nonzero(peaks)
+    order = np.argsort(-heat[v, u], kind="stable")[:most]
+    v, u = v[order], u[order]
+    return np.stack([u, v], axis=1).astype(np.float64), heat[v, u]
 
 
 def suppressed(heat: Float32Array) -> BoolArray:
@@ -131,6 +139,7 @@ class SuperGlueMatcher:
     """Keeps no state between calls, so one object may serve several threads.
 
     Args:
+        name: of the matcher.
         extractor: of SuperPoint's features.
         extractor_sha256: of its graph.
         graph: SuperGlue's.
@@ -142,6 +151,7 @@ class SuperGlueMatcher:
 
     def __init__(
         self,
+        name: str,
         extractor: SuperPointExtractor,
         extractor_sha256: str,
         graph: StoredGraph,
@@ -150,7 +160,7 @@ class SuperGlueMatcher:
         working_px: int,
         threads: int,
     ) -> None:
-        self.name = "superpoint-superglue"
+        self.name = name
         self.model_sha256: str | None = joint_sha256(extractor_sha256, graph.sha256)
         self.working_px = working_px
         self._min_confidence = min_confidence
@@ -159,7 +169,7 @@ class SuperGlueMatcher:
             f"{side}_{what}" for side in ("query", "reference") for what in ("descriptors", "places", "scores")
         ]
         self._inference = Inference(
-            graph.path, graph.sha256, threads, what="SuperGlue", model=self.name, inputs=self._inputs,
+            graph.path, graph.sha256, threads, what="SuperGlue", model="superpoint-superglue", inputs=self._inputs,
             outputs=["log_assignment"],
         )  # fmt: skip
 
@@ -184,6 +194,24 @@ class SuperGlueMatcher:
         probability = np.exp(np.minimum(logs[i, j], 0.0)).astype(np.float64)
         kept = probability > self._min_confidence
         return Matches(query.keypoints_px[i[kept]], reference.keypoints_px[j[kept]], probability[kept])
+
+
+def make_superpoint_matcher(
+    name: str, entry: ExportedMatcher, graphs: Sequence[StoredGraph], working_px: int, max_keypoints: int, threads: int
+) -> Matcher:
+    """With SuperGlue or with LightGlue. Raises: as `SuperPointExtractor`."""
+    extraction, matching = graphs
+    extractor = SuperPointExtractor(
+        extraction, model=entry.name, min_score=_MIN_SCORE[entry.name], working_px=working_px,
+        max_keypoints=min(max_keypoints, _MOST_KEYPOINTS), threads=threads,
+    )  # fmt: skip
+    if entry.name == "superpoint-superglue":
+        return SuperGlueMatcher(
+            name, extractor, extraction.sha256, matching, min_confidence=entry.min_confidence, working_px=working_px,
+            threads=threads,
+        )  # fmt: skip
+    network = matching.path.read_bytes(), matching.sha256
+    return GlueMatcher(name, extractor, [extraction.sha256], network, working_px=working_px, threads=threads)
 
 
 def places(features: Features) -> Float32Array:

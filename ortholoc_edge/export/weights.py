@@ -1,0 +1,128 @@
+"""Files of weights: fetched where asked for, compared with their hashes, read without running what is in them."""
+
+from __future__ import annotations
+
+import argparse
+import http.client
+import pickle
+import urllib.error
+import urllib.request
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+
+from ortholoc_edge.errors import ModelError
+from ortholoc_edge.matching.exported import WeightsFile, file_sha256
+
+# What published checkpoints wrap their tensors in, and put before their names.
+_WRAPPERS: Final = ("state_dict", "model", "model_state_dict")
+_PREFIXES: Final = ("matcher.", "model.")
+_TIMEOUT_S: Final = 60.0
+_CHUNK_BYTES: Final = 1 << 20
+
+
+def read_weights(path: Path, file: WeightsFile) -> dict[str, torch.Tensor]:
+    """Tensors by name, without what the project wraps them in.
+
+    Raises: ModelError for a file that can't be read, is damaged, or holds more than tensors and plain values.
+    """
+    try:
+        if path.suffix == ".safetensors":
+            from safetensors.torch import load_file
+
+            entries: Any = load_file(path)
+        else:
+            # Checkpoints of DUSt3R and MASt3R keep the training's arguments, too: a class of plain values.
+            with torch.serialization.safe_globals([argparse.Namespace]):
+                entries = torch.load(path, map_location="cpu", weights_only=True)
+    except OSError as err:
+        raise ModelError(f"weights {path} can't be read ({err.strerror or err}); check the path") from err
+    # safetensors' own exception derives from Exception alone.
+    except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, KeyError, TypeError, Exception) as err:
+        raise ModelError(
+            f"weights {path} can't be read as plain tensors ({str(err).splitlines()[0] if str(err) else err!r}); use "
+            f"{file.file} of {file.project}"
+        ) from err
+    for wrapper in _WRAPPERS:
+        if isinstance(entries, Mapping) and isinstance(entries.get(wrapper), Mapping):
+            entries = entries[wrapper]
+            break
+    if not isinstance(entries, Mapping) or not entries:
+        raise ModelError(f"weights {path}: no tensors by name are in it; use {file.file} of {file.project}")
+    tensors = {}
+    for name, value in entries.items():
+        if not isinstance(name, str) or not isinstance(value, torch.Tensor):
+            raise ModelError(f"weights {path}: entry {name!r} is no tensor; use {file.file} of {file.project}")
+        for prefix in _PREFIXES:
+            name = name.removeprefix(prefix)  # noqa: PLW2901
+        tensors[name] = value.float() if value.is_floating_point() else value
+    return tensors
+
+
+def take(model: torch.nn.Module, weights: Mapping[str, torch.Tensor], part: str, may_lack: Sequence[str] = ()) -> None:
+    """Put ``weights`` into ``model``: all that it has, but for names that begin with one of ``may_lack``.
+
+    Raises: ModelError if one is missing or has another shape.
+    """
+    try:
+        missing = model.load_state_dict(dict(weights), strict=False).missing_keys
+    except RuntimeError as err:
+        raise ModelError(
+            f"weights of {part}: {str(err).splitlines()[-1].strip()}; this is another network's file"
+        ) from err
+    missing = [
+        name for name in missing if not name.endswith("num_batches_tracked") and not name.startswith(tuple(may_lack))
+    ]
+    if missing:
+        raise ModelError(
+            f"weights of {part}: {len(missing)} tensors are missing, {missing[0]!r} the first; this is another "
+            "network's file"
+        )
+
+
+def checked(path: Path, file: WeightsFile, sha256: str | None) -> tuple[str, bool]:
+    """The file's hash, and whether it was compared with one that we or the user know.
+
+    Raises: ModelError if it differs or can't be read.
+    """
+    try:
+        actual = file_sha256(path)
+    except OSError as err:
+        raise ModelError(f"weights {path} can't be read ({err.strerror}); check the path") from err
+    for expected, whose in ((file.sha256, f"of {file.file} of {file.project}"), (sha256, "that was given")):
+        if expected is not None and actual != expected.lower():
+            raise ModelError(
+                f"weights {path}: SHA-256 is {actual}, {whose} {expected.lower()}; get {file.file} from {file.project}"
+            )
+    return actual, file.sha256 is not None or sha256 is not None
+
+
+def fetch(file: WeightsFile, folder: Path) -> Path:
+    """The file from its official address, kept in ``folder``; nothing is fetched where it is there already.
+
+    Raises: ModelError if it can't be had, differs, or has no address or no hash that it could be compared with.
+    """
+    by_hand = f"get {file.file} from {file.project} yourself and give it with --weights"
+    if file.address is None or file.sha256 is None:
+        lacks = "address" if file.address is None else "SHA-256"
+        raise ModelError(
+            f"weights {file.file} of {file.project} can't be fetched: no lasting {lacks} is known; {by_hand}"
+        )
+    target = folder / file.file
+    if target.is_file() and file_sha256(target) == file.sha256:
+        return target
+    folder.mkdir(parents=True, exist_ok=True)
+    partial = folder / f".{file.file}.partial"
+    try:
+        with urllib.request.urlopen(file.address, timeout=_TIMEOUT_S) as answer, partial.open("wb") as out:
+            while chunk := answer.read(_CHUNK_BYTES):
+                out.write(chunk)
+        checked(partial, file, None)
+        partial.replace(target)
+    except (urllib.error.URLError, http.client.HTTPException, TimeoutError) as err:
+        raise ModelError(f"weights {file.address} can't be fetched ({err}); check the network, or {by_hand}") from err
+    finally:
+        partial.unlink(missing_ok=True)
+    return target
