@@ -11,6 +11,8 @@ from typing import Any
 
 from ortholoc_edge.cli.progress import ProgressBar
 from ortholoc_edge.errors import ConfigError, ModelError
+from ortholoc_edge.export import require
+from ortholoc_edge.export.order import Order, check_order
 from ortholoc_edge.matching import exported, models
 from ortholoc_edge.matching.exported import EXPORTED
 
@@ -125,12 +127,6 @@ def _built(name: str, wheel: Path | None, *, only_if_absent: bool) -> models.Sto
 
 
 def _build_exported(args: argparse.Namespace) -> int:
-    from ortholoc_edge import export
-
-    export.require(args.name)
-    # Only now: it takes PyTorch.
-    from ortholoc_edge.export.build import Order, build
-
     entry = EXPORTED[args.name]
     order = Order(
         weights={part: Path(file) for part, file in _by_part(entry, args.weights, "--weights").items()},
@@ -142,6 +138,11 @@ def _build_exported(args: argparse.Namespace) -> int:
         fine_size=args.fine_size,
         wheel=args.wheel,
     )
+    check_order(entry, order)
+    require(args.name)
+    # Only now: it takes PyTorch.
+    from ortholoc_edge.export.build import build
+
     with ProgressBar(f"model {args.name}") as bar:
         record = build(args.name, order, bar.step)
     for used in record["weights"]:

@@ -14,11 +14,12 @@ from typing import Any, Final
 import onnx
 import torch
 
-from ortholoc_edge.errors import ConfigError, ModelError
+from ortholoc_edge.errors import ConfigError
 from ortholoc_edge.export import keypoints, pair_points, point_maps, require, warps
 from ortholoc_edge.export.graphs import OPSET, TorchGraph, write_graph
+from ortholoc_edge.export.order import Order, Size, check_order, checked, fetch
 from ortholoc_edge.export.sources import project_code
-from ortholoc_edge.export.weights import checked, fetch, read_weights
+from ortholoc_edge.export.weights import read_weights
 from ortholoc_edge.matching.exported import (
     EXPORTED,
     ExportedMatcher,
@@ -27,7 +28,6 @@ from ortholoc_edge.matching.exported import (
     load,
     record_path,
     stored_name,
-    where_from,
 )
 from ortholoc_edge.matching.models import Progress, build_lock, model_directory, replace_file, storage_errors
 
@@ -35,7 +35,6 @@ _SEED: Final = 20240501
 _TRAINING: Final = ("loguru", "joblib", "pytorch_lightning", "pytorch_lightning.utilities")
 
 Weights = Mapping[str, Mapping[str, torch.Tensor]] | None
-Size = tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,32 +85,6 @@ _RECIPES: Final[dict[str, _Recipe]] = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class Order:
-    """What to build of.
-
-    Attributes:
-        weights: files by part.
-        sha256: their hashes by part, as the user knows them.
-        fetch: whether what is not given may be fetched from its official address.
-        accept_non_commercial: the yes that such a licence takes.
-        random_weights: instead of files; only for tests.
-        small: of random weights: a network of the same kind with fewer layers.
-        size, fine_size: (width, height) px instead of the catalogue's.
-        wheel: a copy of the pinned wheel with the networks' code.
-    """
-
-    weights: Mapping[str, Path] = field(default_factory=dict)
-    sha256: Mapping[str, str] = field(default_factory=dict)
-    fetch: bool = False
-    accept_non_commercial: bool = False
-    random_weights: bool = False
-    small: bool = False
-    size: Size | None = None
-    fine_size: Size | None = None
-    wheel: Path | None = None
-
-
 def build(name: str, order: Order, progress: Progress | None = None) -> dict[str, Any]:
     """Export a matcher, compare it with its published code, and put it into the store.
 
@@ -121,7 +94,7 @@ def build(name: str, order: Order, progress: Progress | None = None) -> dict[str
     require(name)
     entry, recipe = EXPORTED[name], _RECIPES[name]
     size, fine_size = _sizes(entry, recipe, order)
-    _check_order(entry, order)
+    check_order(entry, order)
 
     def step(done: int, what: str) -> None:
         if progress is not None:
@@ -180,31 +153,6 @@ def build(name: str, order: Order, progress: Progress | None = None) -> dict[str
         step(3, "done")
     load(name, random_weights=order.random_weights)
     return record
-
-
-def _check_order(entry: ExportedMatcher, order: Order) -> None:
-    parts = [file.part for file in entry.files]
-    for given in (*order.weights, *order.sha256):
-        if given not in parts:
-            raise ConfigError(f"matcher {entry.name} has no weights {given!r}; its parts are {', '.join(parts)}")
-    if entry.non_commercial and not order.accept_non_commercial:
-        raise ModelError(
-            f"matcher {entry.name}: the licence of its weights and code ({entry.licence}) forbids commercial use; if yours "
-            "is not, say so with --accept-non-commercial"
-        )
-    if order.random_weights:
-        if order.weights or order.fetch:
-            raise ConfigError(f"matcher {entry.name}: random weights or files of weights, not both")
-        return
-    if order.small:
-        raise ConfigError(f"matcher {entry.name}: published weights fit the whole network only")
-    lacking = [file for file in entry.files if file.part not in order.weights]
-    if lacking and not order.fetch:
-        several = len(entry.files) > 1
-        flags = " ".join(f"--weights {f'{file.part}=' if several else ''}{file.file}" for file in lacking)
-        fetchable = all(file.address is not None and file.sha256 is not None for file in lacking)
-        remedy = f", or let them be fetched with --fetch ({', '.join(str(file.address) for file in lacking)})"
-        raise ModelError(f"matcher {entry.name} needs {where_from(entry)}; give {flags}{remedy if fetchable else ''}")
 
 
 def _weights(entry: ExportedMatcher, order: Order) -> tuple[list[dict[str, Any]], dict[str, dict[str, torch.Tensor]]]:

@@ -63,17 +63,19 @@ def project_code(
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         archive.extractall(into, [item for item in archive.namelist() if item.startswith(f"{_FOLDER}/{project}/")])
     folder = into / _FOLDER / project
+    stand_ins: dict[str, Any] = {one: mock.MagicMock(name=one) for one in unused}
+    stand_ins |= {old: importlib.import_module(new) for old, new in (moved or {}).items()}
+    stand_ins = {one: module for one, module in stand_ins.items() if one not in sys.modules}
     path, known = list(sys.path), set(sys.modules)
     sys.path[:0] = [str(folder / root) for root in roots]
+    sys.modules.update(stand_ins)
     try:
-        stand_ins: dict[str, Any] = {one: mock.MagicMock(name=one) for one in unused}
-        stand_ins |= {old: importlib.import_module(new) for old, new in (moved or {}).items()}
-        with mock.patch.dict(sys.modules, stand_ins):
-            yield folder
+        yield folder
     finally:
         sys.path[:] = path
+        # Not all that is new: torch, too, imports some of its own on the way, and only once.
         for added in set(sys.modules) - known:
-            if str(getattr(sys.modules[added], "__file__", None) or "").startswith(str(into)):
+            if added in stand_ins or str(getattr(sys.modules[added], "__file__", None) or "").startswith(str(into)):
                 del sys.modules[added]
 
 

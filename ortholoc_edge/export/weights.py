@@ -1,12 +1,9 @@
-"""Files of weights: fetched where asked for, compared with their hashes, read without running what is in them."""
+"""Files of weights read without running what is in them, and put into networks."""
 
 from __future__ import annotations
 
 import argparse
-import http.client
 import pickle
-import urllib.error
-import urllib.request
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -14,13 +11,11 @@ from typing import Any, Final
 import torch
 
 from ortholoc_edge.errors import ModelError
-from ortholoc_edge.matching.exported import WeightsFile, file_sha256
+from ortholoc_edge.matching.exported import WeightsFile
 
 # What published checkpoints wrap their tensors in, and put before their names.
 _WRAPPERS: Final = ("state_dict", "model", "model_state_dict")
 _PREFIXES: Final = ("matcher.", "model.")
-_TIMEOUT_S: Final = 60.0
-_CHUNK_BYTES: Final = 1 << 20
 
 
 def read_weights(path: Path, file: WeightsFile) -> dict[str, torch.Tensor]:
@@ -80,49 +75,3 @@ def take(model: torch.nn.Module, weights: Mapping[str, torch.Tensor], part: str,
             f"weights of {part}: {len(missing)} tensors are missing, {missing[0]!r} the first; this is another "
             "network's file"
         )
-
-
-def checked(path: Path, file: WeightsFile, sha256: str | None) -> tuple[str, bool]:
-    """The file's hash, and whether it was compared with one that we or the user know.
-
-    Raises: ModelError if it differs or can't be read.
-    """
-    try:
-        actual = file_sha256(path)
-    except OSError as err:
-        raise ModelError(f"weights {path} can't be read ({err.strerror}); check the path") from err
-    for expected, whose in ((file.sha256, f"of {file.file} of {file.project}"), (sha256, "that was given")):
-        if expected is not None and actual != expected.lower():
-            raise ModelError(
-                f"weights {path}: SHA-256 is {actual}, {whose} {expected.lower()}; get {file.file} from {file.project}"
-            )
-    return actual, file.sha256 is not None or sha256 is not None
-
-
-def fetch(file: WeightsFile, folder: Path) -> Path:
-    """The file from its official address, kept in ``folder``; nothing is fetched where it is there already.
-
-    Raises: ModelError if it can't be had, differs, or has no address or no hash that it could be compared with.
-    """
-    by_hand = f"get {file.file} from {file.project} yourself and give it with --weights"
-    if file.address is None or file.sha256 is None:
-        lacks = "address" if file.address is None else "SHA-256"
-        raise ModelError(
-            f"weights {file.file} of {file.project} can't be fetched: no lasting {lacks} is known; {by_hand}"
-        )
-    target = folder / file.file
-    if target.is_file() and file_sha256(target) == file.sha256:
-        return target
-    folder.mkdir(parents=True, exist_ok=True)
-    partial = folder / f".{file.file}.partial"
-    try:
-        with urllib.request.urlopen(file.address, timeout=_TIMEOUT_S) as answer, partial.open("wb") as out:
-            while chunk := answer.read(_CHUNK_BYTES):
-                out.write(chunk)
-        checked(partial, file, None)
-        partial.replace(target)
-    except (urllib.error.URLError, http.client.HTTPException, TimeoutError) as err:
-        raise ModelError(f"weights {file.address} can't be fetched ({err}); check the network, or {by_hand}") from err
-    finally:
-        partial.unlink(missing_ok=True)
-    return target

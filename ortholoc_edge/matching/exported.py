@@ -35,7 +35,8 @@ class WeightsFile:
         file: its published name.
         project: who publishes it.
         address: on the project's own pages; None: they name no lasting one.
-        sha256: that the file must have; None: not known to us, so what the user gives is taken and its hash recorded.
+        sha256: that the file must have, as at least two projects that use it state it; None: not known to us, so what
+            the user gives is taken and its hash recorded.
     """
 
     part: str
@@ -113,6 +114,7 @@ _DINOV2_FILE: Final = WeightsFile(
     "dinov2_vitl14_pretrain.pth",
     "facebookresearch/dinov2",
     "https://dl.fbaipublicfiles.com/dinov2/dinov2_vitl14/dinov2_vitl14_pretrain.pth",
+    "d5383ea8f4877b2472eb973e0fd72d557c7da5d3611bd527ceeb1d7162cbf428",
 )
 
 _ALL: Final = (
@@ -125,6 +127,8 @@ _ALL: Final = (
                 "superglue",
                 "superglue_outdoor.pth",
                 "magicleap/SuperGluePretrainedNetwork",
+                "https://github.com/magicleap/SuperGluePretrainedNetwork/raw/master/models/weights/superglue_outdoor.pth",
+                "2f5f5e9bb3febf07b69df633c4c3ff7a17f8af26a023aae2b9303d22339195bd",
             ),
         ),
         licence=_MAGIC_LEAP,
@@ -170,12 +174,14 @@ _ALL: Final = (
                 "dedode_detector_L_v2.pth",
                 "Parskatt/DeDoDe",
                 "https://github.com/Parskatt/DeDoDe/releases/download/v2/dedode_detector_L_v2.pth",
+                "4113809dd9e0367af013a45fc2255a6b243ff241cd06520d17a65d9e231bdc17",
             ),
             WeightsFile(
                 "descriptor",
                 "dedode_descriptor_G.pth",
                 "Parskatt/DeDoDe",
                 "https://github.com/Parskatt/DeDoDe/releases/download/dedode_pretrained_models/dedode_descriptor_G.pth",
+                "ef6e3f2911bb3c179960db15545a2137d0746054bb5bad75559524ccab1fee41",
             ),
             _DINOV2_FILE,
         ),
@@ -206,7 +212,14 @@ _ALL: Final = (
     ExportedMatcher(
         name="minima-loftr",
         family="pairs",
-        files=(WeightsFile("loftr", "minima_loftr.ckpt", "LSXI7/MINIMA"),),
+        files=(
+            WeightsFile(
+                "loftr",
+                "minima_loftr.ckpt",
+                "LSXI7/MINIMA",
+                "https://github.com/LSXI7/storage/releases/download/MINIMA/minima_loftr.ckpt",
+            ),
+        ),
         licence="Apache-2.0",
         non_commercial=False,
         note="MINIMA: Ren, Jiang, Li, Liang, Wang, Liu, Liu, CVPR 2025; LoFTR: Sun, Shen, Wang, Bao, Zhou, CVPR 2021",
@@ -219,7 +232,14 @@ _ALL: Final = (
     ExportedMatcher(
         name="eloftr",
         family="pairs",
-        files=(WeightsFile("eloftr", "eloftr_outdoor.ckpt", "zju3dv/EfficientLoFTR"),),
+        files=(
+            WeightsFile(
+                "eloftr",
+                "eloftr_outdoor.ckpt",
+                "zju3dv/EfficientLoFTR",
+                sha256="0af6291141c736e75e94b7f8aae4399b77c7731b3f08758212b2cfe370188878",
+            ),
+        ),
         licence="Apache-2.0",
         non_commercial=False,
         note="Efficient LoFTR, full model: Wang, He, Peng, Tan, Zhou, CVPR 2024",
@@ -269,7 +289,8 @@ _ALL: Final = (
         files=(WeightsFile("dkm", "gim_dkm_100h.ckpt", "xuelunshen/gim"),),
         licence="MIT",
         non_commercial=False,
-        note="GIM: Shen, Cai, Yin, Müller, Li, Wang, Chen, Wang, ICLR 2024; DKMv3: Edstedt et al., CVPR 2023",
+        note="GIM (for research, says its README): Shen, Cai, Yin, Müller, Li, Wang, Chen, Wang, ICLR 2024; "
+        "DKMv3: Edstedt et al., CVPR 2023",
         million_parameters=72.3,
         contract=_WARP_CONTRACT,
         package=_VISMATCH,
@@ -326,6 +347,7 @@ _ALL: Final = (
                 "roma_outdoor.pth",
                 "Parskatt/RoMa",
                 "https://github.com/Parskatt/storage/releases/download/roma/roma_outdoor.pth",
+                "c7a45c80d41ad788a63c641d1b686d7cb3f297f40097c6f4e75039889e5cc8ba",
             ),
             _DINOV2_FILE,
         ),
@@ -342,7 +364,15 @@ _ALL: Final = (
     ExportedMatcher(
         name="minima-roma",
         family="warp",
-        files=(WeightsFile("roma", "minima_roma.pth", "LSXI7/MINIMA"), _DINOV2_FILE),
+        files=(
+            WeightsFile(
+                "roma",
+                "minima_roma.pth",
+                "LSXI7/MINIMA",
+                "https://github.com/LSXI7/storage/releases/download/MINIMA/minima_roma.pth",
+            ),
+            _DINOV2_FILE,
+        ),
         licence="Apache-2.0",
         non_commercial=False,
         note="MINIMA: Ren, Jiang, Li, Liang, Wang, Liu, Liu, CVPR 2025; RoMa: Edstedt et al., CVPR 2024",

@@ -15,7 +15,7 @@ from tiny_graphs import FINE, HEIGHT, SHIFT_PX, WIDTH
 
 from ortholoc_edge.cli import main
 from ortholoc_edge.errors import ConfigError, ModelError
-from ortholoc_edge.matching import dedode, exported, models, pairs, superpoint
+from ortholoc_edge.matching import dedode, models, pairs, superpoint
 from ortholoc_edge.matching.exported import EXPORTED
 from ortholoc_edge.matching.registry import MATCHERS, METHODS, RANDOM, make_matcher, make_method
 from ortholoc_edge.matching.types import Features, Matcher, Matches, UnscaledMatcher
@@ -61,9 +61,7 @@ def test_pixels_come_back_without_bias(matcher: Matcher, shape: tuple[int, int])
     found = _matches(matcher, field(columns, rows), other)
     assert len(found) > 30
     scale = np.array([columns / width, rows / height]), np.array([(columns + 40) / width, (rows + 20) / height])
-    query, reference = (
-        (px + 0.5) / s - 0.5 for px, s in zip((found.query_px, found.map_px), scale, strict=True)
-    )
+    query, reference = ((px + 0.5) / s - 0.5 for px, s in zip((found.query_px, found.map_px), scale, strict=True))
     tolerance = 2e-5 if matcher.name == "gim-dkm" else 1e-6  # a warp is float32 of -1..1
     np.testing.assert_allclose(reference - query, np.tile([SHIFT_PX, 0.0], (len(found), 1)), atol=tolerance)
     expected = 0.25 if matcher.name == "loftr" else 0.0
@@ -101,7 +99,10 @@ def test_what_the_protocol_asks(matcher: Matcher) -> None:
     assert not isinstance(matcher, UnscaledMatcher)
     assert len(matcher.extract(field(320, 256))) == 0
     with pytest.raises(ValueError, match="another matcher's"):
-        matcher.match(Features(np.empty((0, 2)), np.empty(0, np.float32), np.empty((0, 0), np.float32)), matcher.extract(field(320, 256)))
+        matcher.match(
+            Features(np.empty((0, 2)), np.empty(0, np.float32), np.empty((0, 0), np.float32)),
+            matcher.extract(field(320, 256)),
+        )
     found = _matches(matcher, field(320, 256), field(320, 256))
     assert len(found) <= 400
     if matcher.name == "dust3r":
@@ -124,6 +125,16 @@ def test_points_that_the_network_distrusts_are_left_out(folder: Path) -> None:
     assert len(_matches(_make("dust3r"), field(320, 256), field(320, 256))) == 0
 
 
+def test_pixels_of_an_uncertain_warp_are_left_out(folder: Path) -> None:
+    tiny_graphs.store("gim-dkm", {"": tiny_graphs.warp()}, folder)
+    found = _matches(_make("gim-dkm"), field(*FINE), field(*FINE))
+    assert len(found) > 150
+    assert found.query_px[:, 1].max() < FINE[1] // 2
+    # As the published code has it: what it takes is sure.
+    assert found.confidence is not None
+    assert set(found.confidence) == {1.0}
+
+
 def test_most_certain_pixel_of_each_cell() -> None:
     certainty = np.zeros((7, 10), np.float32)
     certainty[1, 2], certainty[3, 3], certainty[6, 9] = 0.5, 0.9, 0.4
@@ -139,12 +150,8 @@ def test_reciprocal_neighbours_are_those_of_all_pairs(euclidean: bool) -> None:
     source = np.random.default_rng(5)
     query = source.normal(size=(300, 4)).astype(np.float32) + np.float32(100 * euclidean)
     reference = source.normal(size=(280, 4)).astype(np.float32) + np.float32(100 * euclidean)
-    likeness = (
-        -np.square(query[:, None].astype(np.float64) - reference).sum(-1) if euclidean else query @ reference.T
-    )
-    mutual = {
-        (i, int(j)) for i, j in enumerate(likeness.argmax(1)) if likeness[:, j].argmax() == i
-    }
+    likeness = -np.square(query[:, None].astype(np.float64) - reference).sum(-1) if euclidean else query @ reference.T
+    mutual = {(i, int(j)) for i, j in enumerate(likeness.argmax(1)) if likeness[:, j].argmax() == i}
     i, j = pairs.reciprocal_nearest(query, reference, np.arange(300), euclidean=euclidean)
     found = set(zip(i.tolist(), j.tolist(), strict=True))
     assert found <= mutual
@@ -245,9 +252,11 @@ def test_paper_is_complete() -> None:
 
 
 def test_what_is_not_built_says_how(folder: Path) -> None:
-    with pytest.raises(ModelError, match="outdoor_ds.ckpt from zju3dv/LoFTR.*models build loftr --weights outdoor_ds.ckpt"):
+    with pytest.raises(ModelError, match=r"from zju3dv/LoFTR.*models build loftr --weights outdoor_ds\.ckpt"):
         _make("loftr")
-    with pytest.raises(ModelError, match="--weights roma=roma_outdoor.pth --weights dinov2=dinov2_vitl14_pretrain.pth"):
+    with pytest.raises(
+        ModelError, match=r"--weights roma=roma_outdoor.pth --weights dinov2=dinov2_vitl14_pretrain.pth"
+    ):
         _make("roma")
     with pytest.raises(ModelError, match="--accept-non-commercial"):
         _make("dust3r")
@@ -255,7 +264,7 @@ def test_what_is_not_built_says_how(folder: Path) -> None:
 
 def test_a_non_commercial_licence_takes_the_yes_that_was_recorded(folder: Path) -> None:
     tiny_graphs.store("dust3r", {"": tiny_graphs.points()}, folder, accepted=False)
-    with pytest.raises(ModelError, match="CC-BY-NC-SA-4.0.*forbids commercial use.*--accept-non-commercial"):
+    with pytest.raises(ModelError, match=r"CC-BY-NC-SA-4.0.*forbids commercial use.*--accept-non-commercial"):
         _make("dust3r")
     # Where the licence asks for no yes, none is needed.
     tiny_graphs.store("loftr", {"": tiny_graphs.pairs()}, folder, accepted=False)
@@ -268,7 +277,7 @@ def test_random_weights_are_never_taken_for_a_matcher(folder: Path) -> None:
         _make("loftr")
     assert "loftr-random-weights" in RANDOM
     assert not set(RANDOM) & set(METHODS)
-    with pytest.raises(ConfigError, match="random weights.*name loftr"):
+    with pytest.raises(ConfigError, match=r"random weights.*name loftr"):
         _make("loftr-random-weights")
     # What the daemon calls.
     with pytest.raises(ConfigError, match="'loftr-random-weights' is not known"):

@@ -17,7 +17,9 @@ FINE = 320, 256
 SHIFT_PX = 3
 
 
-def graph(inputs: Mapping[str, Sequence[Any]], outputs: Mapping[str, np.ndarray | str], nodes: Sequence[Any] = ()) -> bytes:
+def graph(
+    inputs: Mapping[str, Sequence[Any]], outputs: Mapping[str, np.ndarray | str], nodes: Sequence[Any] = ()
+) -> bytes:
     """Of constant outputs, and of those whose value is the name of a node's output."""
     made = list(nodes)
     constants = []
@@ -58,12 +60,13 @@ def pairs() -> bytes:
     v, u = np.mgrid[8:HEIGHT:16, 8:WIDTH:16]
     query = np.stack([u.ravel(), v.ravel()], axis=1) + 0.25
     confidence = np.linspace(1.0, 0.0, len(query))
-    outputs = {"query_px": query, "reference_px": query + [SHIFT_PX, 0], "confidence": confidence}
+    outputs = {"query_px": query, "reference_px": query + np.array([SHIFT_PX, 0]), "confidence": confidence}
     return graph({"query": picture(), "reference": picture()}, outputs)
 
 
 def warp() -> bytes:
-    """All of the query moved by `SHIFT_PX` of the fine view; certain where that is inside."""
+    """All of the query moved by `SHIFT_PX` of the fine view; certain where that is inside, but for the lower half: that
+    is less than the published limit."""
     width, height = FINE
     u, v = np.meshgrid(np.arange(width), np.arange(height))
 
@@ -71,8 +74,13 @@ def warp() -> bytes:
         return np.stack([(u + shift + 0.5) * 2 / width - 1, (v + 0.5) * 2 / height - 1], axis=-1)
 
     both = np.stack([places(SHIFT_PX), places(-SHIFT_PX)])
-    certainty = (np.abs(both) <= 1).all(axis=-1) * 0.9
-    inputs = {"query": picture(), "reference": picture(), "query_fine": picture(*FINE), "reference_fine": picture(*FINE)}
+    certainty = (np.abs(both) <= 1).all(axis=-1) * np.where(v < height // 2, 0.06, 0.04)
+    inputs = {
+        "query": picture(),
+        "reference": picture(),
+        "query_fine": picture(*FINE),
+        "reference_fine": picture(*FINE),
+    }
     return graph(inputs, {"warp": both, "certainty": certainty})
 
 
