@@ -212,6 +212,9 @@ def _exported_state(name: str, *, random_weights: bool) -> dict[str, Any]:
         "name": exported.stored_name(name, random_weights=random_weights),
         "licence": known.licence,
         "non_commercial": known.non_commercial,
+        "million_parameters": known.million_parameters,
+        "size": known.size,
+        "fine_size": known.fine_size,
         "bytes": None,
         "state": f"needs {exported.where_from(known)}; `{exported.how_to_build(known)}`",
         "path": None,
@@ -226,6 +229,8 @@ def _exported_state(name: str, *, random_weights: bool) -> dict[str, Any]:
         return state | {"state": f"unusable: {err}"}
     hashes = [graph.sha256 for graph in graphs]
     return state | {
+        "size": record.get("size"),
+        "fine_size": record.get("fine_size"),
         "bytes": sum((models.model_directory() / file).stat().st_size for file in record["files"]),
         "state": "random weights: for tests" if random_weights else "ready",
         "path": str(graphs[0].path),

@@ -9,12 +9,25 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
 
 from ortholoc_edge.errors import ModelError
 from ortholoc_edge.matching.exported import WeightsFile
 
 # What published checkpoints wrap their tensors in, and put before their names.
 _WRAPPERS: Final = ("state_dict", "model", "model_state_dict")
+# What torch and safetensors raise on bytes that are damaged or of another kind.
+_DAMAGED: Final = (
+    SafetensorError,
+    RuntimeError,
+    pickle.UnpicklingError,
+    EOFError,
+    ValueError,
+    TypeError,
+    AttributeError,
+    LookupError,
+)
 _PREFIXES: Final = ("matcher.", "model.")
 
 
@@ -25,8 +38,6 @@ def read_weights(path: Path, file: WeightsFile) -> dict[str, torch.Tensor]:
     """
     try:
         if path.suffix == ".safetensors":
-            from safetensors.torch import load_file
-
             entries: Any = load_file(path)
         else:
             # Checkpoints of DUSt3R and MASt3R keep the training's arguments, too: a class of plain values.
@@ -34,8 +45,7 @@ def read_weights(path: Path, file: WeightsFile) -> dict[str, torch.Tensor]:
                 entries = torch.load(path, map_location="cpu", weights_only=True)
     except OSError as err:
         raise ModelError(f"weights {path} can't be read ({err.strerror or err}); check the path") from err
-    # safetensors' own exception derives from Exception alone.
-    except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, KeyError, TypeError, Exception) as err:
+    except _DAMAGED as err:
         raise ModelError(
             f"weights {path} can't be read as plain tensors ({str(err).splitlines()[0] if str(err) else err!r}); use "
             f"{file.file} of {file.project}"

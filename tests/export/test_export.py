@@ -3,6 +3,7 @@ the matcher, and asked for a pose. They find nothing, so what counts is that eac
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -44,7 +45,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     try:
         path.write_bytes(models.fetched_wheel(vismatch("loftr")))
     except ModelError as err:
-        if "pip" not in str(err):
+        if "pip" not in str(err) or os.environ.get("ORTHOLOC_EDGE_EXPORT_REQUIRED"):
             raise
         pytest.skip(f"the networks' code can't be fetched here: {err}")
     return path
