@@ -251,6 +251,21 @@ def test_paper_is_complete() -> None:
             assert file.address is None or file.address.startswith("https://")
 
 
+def test_the_documents_table_says_the_same() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "matchers.md").read_text(encoding="utf-8")
+    rows = {row.split("`")[1]: row for row in text.splitlines() if row.startswith("| `")}
+    for entry in EXPORTED.values():
+        row = rows[entry.name]
+        assert ("**non-commercial**" in row) == entry.non_commercial
+        assert entry.licence.split(";")[0].split(" (")[0] in row
+        for file in entry.files:
+            assert f"`{file.file}`" in row
+        for size in filter(None, (entry.size, entry.fine_size)):
+            assert f"{size[0]} x {size[1]}" in row
+        pinned = [file.sha256 is not None for file in entry.files]
+        assert row.split("|")[3].strip() == ("yes" if all(pinned) else "DINOv2 only" if any(pinned) else "no")
+
+
 def test_what_is_not_built_says_how(folder: Path) -> None:
     with pytest.raises(ModelError, match=r"from zju3dv/LoFTR.*models build loftr --weights outdoor_ds\.ckpt"):
         _make("loftr")
