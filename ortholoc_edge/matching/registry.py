@@ -9,12 +9,17 @@ from typing import Final
 from ortholoc_edge.errors import ConfigError
 from ortholoc_edge.matching import models
 from ortholoc_edge.matching.binary import BinaryMatcher
+from ortholoc_edge.matching.exported import EXPORTED, RANDOM_SUFFIX, load
 from ortholoc_edge.matching.sift import SiftMatcher
 from ortholoc_edge.matching.types import STRUCTURAL, AnyMatcher, Matcher, Structural
 
 # Without weights; which of them OpenCV lacks, `binary.unavailable` says.
 BINARY: Final = ("orb", "akaze")
-MATCHERS: Final = ("xfeat", "xfeat-star", "xfeat-lighterglue", "aliked-lightglue", "disk-lightglue", "sift", *BINARY)
+MATCHERS: Final = (
+    "xfeat", "xfeat-star", "xfeat-lighterglue", "aliked-lightglue", "disk-lightglue", "sift", *BINARY, *EXPORTED,
+)  # fmt: skip
+# Graphs of random weights, to test a path with; in none of the lists, so that nobody flies with one.
+RANDOM: Final = tuple(f"{name}{RANDOM_SUFFIX}" for name in EXPORTED)
 # Ways to match a frame with the map: those, structural matching, and structural matching with one of those for frames
 # that it can't place.
 METHODS: Final = (STRUCTURAL, *(f"{STRUCTURAL}+{name}" for name in MATCHERS), *MATCHERS)
@@ -32,9 +37,10 @@ def make_method(
     model_path: Path | None = None,
     model_sha256: str | None = None,
     progress: models.Progress | None = None,
+    random_weights: bool = False,
 ) -> AnyMatcher:
     """One of ``METHODS``; arguments and errors are those of `make_matcher`, for its matcher of features."""
-    if name not in METHODS:
+    if name not in METHODS and not (name in RANDOM and random_weights):
         raise ConfigError(f"matcher {name!r} is not known; known are: {', '.join(METHODS)}")
     if name == STRUCTURAL:
         if model_path is not None or model_sha256 is not None:
@@ -49,6 +55,7 @@ def make_method(
         model_path=model_path,
         model_sha256=model_sha256,
         progress=progress,
+        random_weights=random_weights,
     )
     return Structural(matcher) if structural else matcher
 
@@ -62,21 +69,29 @@ def make_matcher(
     model_path: Path | None = None,
     model_sha256: str | None = None,
     progress: models.Progress | None = None,
+    random_weights: bool = False,
 ) -> Matcher:
     """The matcher of this name, its model loaded (and built first where the store lacks it).
 
     Args:
         name: one of ``MATCHERS``.
-        working_px: long side that images are brought to.
-        max_keypoints: per image; LighterGlue takes no more than `lighterglue.MOST_KEYPOINTS`.
+        working_px: long side that images are brought to; a matcher whose graph has a fixed size keeps to that.
+        max_keypoints: per image, or matches at most of those that look at two pictures at once; LighterGlue takes no
+            more than `lighterglue.MOST_KEYPOINTS`.
         threads: of one inference; SIFT, ORB and AKAZE take OpenCV's setting (``cv2.setNumThreads``).
         model_path: a model file instead of the store's; not for matchers that run several.
         model_sha256: hash that the file must have; None: the record beside the file says it.
         progress: told of a build's steps.
+        random_weights: whether one of ``RANDOM`` may be named: what tests a path, and must not fly.
     Raises: ConfigError for an unknown name, a number out of range or a model where none is used;
         ModelError if the model can't be had.
     """
-    if name not in MATCHERS:
+    if name in RANDOM and not random_weights:
+        raise ConfigError(
+            f"matcher {name!r} has random weights, to test a path with, and finds nothing; name "
+            f"{name.removesuffix(RANDOM_SUFFIX)}"
+        )
+    if name not in MATCHERS + RANDOM:
         raise ConfigError(f"matcher {name!r} is not known; known are: {', '.join(MATCHERS)}")
     if model_path is None and model_sha256 is not None:
         raise ConfigError("a model's SHA-256 was given without the model's file; give both or none")
@@ -89,6 +104,10 @@ def make_matcher(
             if model_path is not None:
                 raise ConfigError(f"matcher {name!r} uses no model; leave {model_path} away")
             return BinaryMatcher(name, working_px=working_px, max_keypoints=max_keypoints)
+        if name in EXPORTED or name in RANDOM:
+            if model_path is not None:
+                raise ConfigError(f"matcher {name!r} is taken from the store only; leave {model_path} away")
+            return _exported(name, working_px, max_keypoints, threads)
         if name in _PAIRED:
             if model_path is not None:
                 raise ConfigError(
@@ -134,3 +153,32 @@ def _paired(
         "disk-lightglue": DiskLightGlueMatcher,
     }
     return kinds[name](*needed, own, working_px=working_px, max_keypoints=max_keypoints, threads=threads)
+
+
+def _exported(name: str, working_px: int, max_keypoints: int, threads: int) -> Matcher:
+    # Late for the same reason.
+    from ortholoc_edge.matching import pairs
+    from ortholoc_edge.matching.dedode import DedodeMatcher
+    from ortholoc_edge.matching.superpoint import make_superpoint_matcher
+
+    entry = EXPORTED[name.removesuffix(RANDOM_SUFFIX)]
+    graphs = load(entry.name, random_weights=name in RANDOM)
+    least = entry.min_confidence
+    match entry.family:
+        case "superpoint":
+            return make_superpoint_matcher(name, entry, graphs, working_px, max_keypoints, threads)
+        case "dedode":
+            return DedodeMatcher(name, graphs, min_confidence=least, max_keypoints=max_keypoints, threads=threads)
+        case "pairs":
+            return pairs.PointPairMatcher(
+                name, graphs[0], min_confidence=least, max_matches=max_keypoints, threads=threads
+            )
+        case "warp":
+            return pairs.WarpMatcher(
+                name, graphs[0], min_confidence=least, max_matches=max_keypoints, threads=threads
+            )
+        case "points":
+            return pairs.PointMapMatcher(
+                name, graphs[0], min_confidence=least, euclidean=entry.name == "dust3r",
+                max_matches=max_keypoints, threads=threads,
+            )  # fmt: skip

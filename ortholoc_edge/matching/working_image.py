@@ -41,6 +41,19 @@ class WorkingImage:
         """Working pixels (N, 2) in the pixels of the original image."""
         return resize_px(px, self.scale)
 
+    def holds(self, px: npt.ArrayLike) -> BoolArray:
+        """Which working pixels (N, 2) lie inside the picture and where it has data."""
+        points = np.asarray(px, dtype=np.float64)
+        rows, columns = self.image.shape
+        inside = np.asarray(
+            ((points >= -0.5) & (points <= [columns - 0.5, rows - 0.5])).all(axis=1), dtype=np.bool_
+        )
+        if self.usable is not None:
+            nearest = np.rint(np.where(inside[:, None], points, 0.0)).astype(np.intp)
+            u, v = np.clip(nearest.T, 0, [[columns - 1], [rows - 1]])
+            inside &= self.usable[v, u]
+        return inside
+
     def strongest(self, px: FloatArray, scores: Float32Array, most: int) -> IntArray:
         """Which of some keypoints (N, 2), with scores (N,), to keep: the best ``most`` usable ones, best first."""
         order = np.argsort(-scores, kind="stable")

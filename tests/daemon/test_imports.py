@@ -9,3 +9,17 @@ import sys
 def test_zenoh_is_not_loaded_while_the_bus_is_off() -> None:
     code = "import sys, ortholoc_edge.daemon; sys.exit('zenoh' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_nothing_that_flies_loads_the_exporter() -> None:
+    code = (
+        "import sys, ortholoc_edge.daemon, ortholoc_edge.matching.pairs, ortholoc_edge.matching.superpoint, "
+        "ortholoc_edge.matching.dedode; "
+        "sys.exit(any(name.startswith(('torch', 'ortholoc_edge.export')) for name in sys.modules))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_the_command_line_loads_no_torch_until_it_exports() -> None:
+    code = "import sys, ortholoc_edge.cli.models; sys.exit('torch' in sys.modules or 'onnx' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

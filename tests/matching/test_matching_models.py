@@ -13,6 +13,7 @@ import pytest
 from ortholoc_edge.cli import models as cli
 from ortholoc_edge.errors import ConfigError, ModelError
 from ortholoc_edge.matching import models
+from ortholoc_edge.matching.exported import EXPORTED
 from ortholoc_edge.matching.registry import METHODS, make_matcher, make_method
 from ortholoc_edge.matching.sift import SiftMatcher
 from ortholoc_edge.matching.types import Structural
@@ -212,12 +213,11 @@ def test_names_and_numbers_of_matchers_are_checked(tmp_path: Path, filled: Path)
 
 def test_methods_are_matchers_and_structural_matching_with_and_without_one(tmp_path: Path) -> None:
     numbers = {"working_px": 512, "max_keypoints": 2048, "threads": 1}
-    assert METHODS == (
-        "structural", "structural+xfeat", "structural+xfeat-star", "structural+xfeat-lighterglue",
-        "structural+aliked-lightglue", "structural+disk-lightglue", "structural+sift", "structural+orb",
-        "structural+akaze",
+    matchers = (
         "xfeat", "xfeat-star", "xfeat-lighterglue", "aliked-lightglue", "disk-lightglue", "sift", "orb", "akaze",
+        *EXPORTED,
     )  # fmt: skip
+    assert ("structural", *(f"structural+{name}" for name in matchers), *matchers) == METHODS
     alone = make_method("structural", **numbers)
     assert isinstance(alone, Structural)
     assert (alone.name, alone.acquire, alone.model_sha256) == ("structural", None, None)
@@ -255,7 +255,7 @@ def test_command_line_lists_states(
     shutil.copytree(xfeat_model.path.parent, store)
     assert _run("list", "--json") == 0
     entries = {entry["name"]: entry for entry in json.loads(capsys.readouterr().out)}
-    assert list(entries) == list(models.CATALOGUE)
+    assert list(entries) == [*models.CATALOGUE, *EXPORTED]
     entry = entries["xfeat"]
     assert (entry["state"], entry["licence"], entry["bytes"]) == (
         "ready",
