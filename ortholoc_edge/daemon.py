@@ -358,6 +358,7 @@ def configured_matcher(options: MatcherOptions) -> AnyMatcher:
         threads=options.threads,
         model_path=None if options.model is None else Path(options.model),
         model_sha256=options.model_sha256,
+        provider=options.provider,
     )
 
 

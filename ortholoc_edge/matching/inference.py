@@ -11,11 +11,12 @@ import onnxruntime as ort
 
 from ortholoc_edge.errors import ModelError
 from ortholoc_edge.geometry.arrays import Float32Array
+from ortholoc_edge.matching import providers
 from ortholoc_edge.matching.models import check_hash
 
 
 class Inference:
-    """A session of its own for one graph.
+    """A session of its own for one graph, computed by the provider in force (`providers.computed_by`).
 
     Args:
         graph: ONNX bytes.
@@ -45,11 +46,12 @@ class Inference:
         check_hash(graph, sha256, f"{what} graph", self._remedy)
         # ONNX Runtime's exceptions share no base but Exception.
         try:
-            self._session = ort.InferenceSession(graph, _options(threads), providers=["CPUExecutionProvider"])
+            self._session = ort.InferenceSession(graph, _options(threads), providers=providers.for_session(threads))
         except Exception as err:
             raise ModelError(
                 f"{what} graph can't be loaded by onnxruntime {ort.__version__} ({err}); {self._remedy}"
             ) from err
+        providers.check_taken(self._session.get_providers(), what)
         found_in = [entry.name for entry in self._session.get_inputs()]
         found_out = {entry.name for entry in self._session.get_outputs()}
         if found_in != list(inputs) or not found_out.issuperset(outputs):
@@ -76,7 +78,7 @@ class Inference:
 
 def _options(threads: int) -> Any:
     options = ort.SessionOptions()
-    options.intra_op_num_threads = threads
+    options.intra_op_num_threads = providers.session_threads(threads)
     options.inter_op_num_threads = 1
     options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
     options.use_deterministic_compute = True
