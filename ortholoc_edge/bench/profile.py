@@ -11,6 +11,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -248,14 +249,9 @@ def _require_memory(processes: Sequence[ProfileProcess], wanted: int) -> None:
 
 def available_mb() -> float | None:
     """Memory that new processes can have, as Linux estimates; None elsewhere."""
-    try:
-        with open("/proc/meminfo", encoding="ascii") as lines:
-            for line in lines:
-                if line.startswith("MemAvailable:"):
-                    return int(line.split()[1]) * 1024 / 1e6
-    except OSError:
-        pass
-    return None
+    meminfo = Path("/proc/meminfo")
+    lines = meminfo.read_text(encoding="ascii").splitlines() if meminfo.is_file() else []
+    return next((int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith("MemAvailable:")), None)
 
 
 def rows(
@@ -329,8 +325,8 @@ def _agreement(steps: Sequence[Flown], full: Sequence[Flown]) -> Agreement:
 
 
 def recommend(measured: Sequence[Row], bounds: Bounds) -> Recommendation:
-    """Of the settings that keep the bounds the one of most detail, since other frames may be harder than these; of those
-    alike the one that takes the least processor time."""
+    """Of the settings that keep the bounds the one of most detail, since other frames may be harder than these; of
+    those alike the one that takes the least processor time."""
     refused = [_refusals(row, measured, bounds) for row in measured]
     kept = [number for number, reasons in enumerate(refused) if not reasons]
     if not kept:

@@ -9,10 +9,10 @@ from typing import Final
 
 from ortholoc_edge.bench.profile import Profile, Row
 
-_WIDTH: Final = 1080
+_WIDTH: Final = 1150
 _ROW: Final = 26
 # Of the bars: where they begin and end; right of them a line of words.
-_LEFT, _RIGHT, _TOP = 290, 700, 64
+_LEFT, _RIGHT, _TOP = 370, 780, 64
 # Of the chart below them.
 _CHART: Final = 250
 _COLOURS: Final = ("#1d4ed8", "#c2410c", "#15803d", "#7c3aed", "#be123c", "#0e7490", "#a16207", "#475569")
@@ -47,8 +47,8 @@ def profile_svg(profile: Profile) -> str:
 def _caption(profile: Profile) -> str:
     begun, ended = profile.load
     return (
-        f"{profile.source}, {profile.rows[0].timed} frames with each setting, in turn, load {begun:.1f} to {ended:.1f}. "
-        "Bar: median; pale: to the 95th of a hundred; mark: the 99th."
+        f"{profile.source}, {profile.rows[0].timed} frames each, in turn; load {begun:.1f} to {ended:.1f}. "
+        "Bar: median; pale: to the 95th of a hundred; mark: the 99th; yellow: recommended."
     )
 
 
@@ -87,10 +87,7 @@ def _bars(profile: Profile, colours: dict[tuple[str, int], str], limit_ms: float
         y = _TOP + _ROW * number + 5
         colour, spent = colours[row.setting.name, row.setting.threads], row.frame_ms
         if number == best:
-            parts.append(
-                f'<rect x="8" y="{y - 4}" width="{_WIDTH - 16}" height="{_ROW - 2}" fill="#fef9c3"/>'
-                + _text(_WIDTH - 16, y + 12, "recommended", "s", "end")
-            )
+            parts.append(f'<rect x="8" y="{y - 4}" width="{_WIDTH - 16}" height="{_ROW - 2}" fill="#fef9c3"/>')
         parts.append(_text(_LEFT - 10, y + 12, row.setting.label, "", "end"))
         for width, opacity in ((spent.p95, 0.3), (spent.median, 1.0)):
             parts.append(

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -162,19 +162,15 @@ class ProfileProcess:
     def step(self) -> Flown:
         """Fly the next frame; after the last the flight begins anew. Raises: OrtholocError with what it said."""
         assert self._process.stdin is not None
-        try:
+        with suppress(BrokenPipeError):  # it ended; the answer tells more
             self._process.stdin.write(b"\n")
             self._process.stdin.flush()
-        except BrokenPipeError:
-            pass  # it ended; the answer tells more
         return self._answer(Flown)
 
     def close(self) -> None:
         assert self._process.stdin is not None and self._process.stdout is not None
-        try:
+        with suppress(BrokenPipeError):
             self._process.stdin.close()
-        except BrokenPipeError:
-            pass
         self._process.stdout.close()
         try:
             self._process.wait(timeout=_END_S)
@@ -331,8 +327,7 @@ def _logged(setting: Setting, source: Source, matcher: AnyMatcher, stack: ExitSt
         config = config_from_text(header.config)
     except ValueError as err:
         raise DatasetError(
-            f"{logs[0]}: its configuration, of version {header.version}, is not understood ({err}); profile it with the "
-            "version that wrote it"
+            f"{logs[0]}: its configuration, of version {header.version}, is not understood ({err}); use that version"
         ) from err
     store = stack.enter_context(
         MapStore(Pack.open(Path(source.pack or header.pack)), features=config.reads_features, memory_bytes=ANY_BYTES)

@@ -33,9 +33,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="how long frames take at reduced resolutions here, what that costs in accuracy, and what to set",
         description="Flies a recorded sequence with each setting (scale, matcher, threads) in a fresh process of its "
         "own, through the steps that the daemon takes, all settings frame by frame in turn, so that a busy machine "
-        "hits them alike. Prints wall time of frames and stages, processor time, memory and, beside them, accuracy: against the "
-        "true poses of a flight folder, against full detail where a flight log has none. With --rate it recommends a "
-        "setting. See docs/profile.md.",
+        "hits them alike. Prints wall time of frames and stages, processor time, memory and, beside them, accuracy: "
+        "against the true poses of a flight folder, against full detail where a flight log has none. With --rate it "
+        "recommends a setting. See docs/profile.md.",
     )
     parser.add_argument(
         "--frames",
