@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -192,6 +193,8 @@ class ProfileProcess:
 
 def serve() -> None:
     """What `ProfileProcess` runs: a line of input, a step."""
+    # An interrupt reaches all processes of a terminal; this one ends when its input does.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         _serve(*msgspec.json.decode(sys.argv[1], type=tuple[Setting, Source]))
     except OrtholocError as err:
