@@ -33,6 +33,8 @@ MOST_SETTINGS: Final = 24
 # Left for the rest of the machine, MB, while processes are started.
 _SPARE_MB: Final = 64.0
 _STRICT: Final = "1m_1deg"
+# Part of a frame's stages run beside each other, so that alone a frame takes less wall time than processor time.
+BUSY: Final = 1.5
 
 
 class Accuracy(Struct, frozen=True, kw_only=True):
@@ -126,12 +128,15 @@ class Profile(Struct, frozen=True, kw_only=True):
     Attributes:
         measured: command, date and machine.
         load: the machine's load averages (1 minute) at the beginning and the end.
+        waited: wall time of a frame over its processor time, least of the settings that only the processor computes:
+            about 1 on an idle machine, and wall times beyond ``BUSY`` are others' load. None if there are none.
         passes: over ``source``, each with noise of its own. warm_up_frames: of each setting, not timed.
         merged: what was asked for and is measured as another.
     """
 
     measured: str
     load: tuple[float, float]
+    waited: float | None
     source: str
     pack: str
     prior: str
@@ -230,6 +235,12 @@ def measure(
                 done += 1
                 progress(done, steps)
         return rows(asked, [one.started for one in processes], flown, warm_up_frames)
+
+
+def waited(measured: Sequence[Row]) -> float | None:
+    """See `Profile.waited`."""
+    ratios = [row.frame_ms.median / row.cpu_ms.median for row in measured if row.setting.provider == "cpu"]
+    return min(ratios, default=None)
 
 
 def _turn(step: int, count: int) -> list[int]:
@@ -414,6 +425,7 @@ def markdown(profile: Profile) -> str:
         f"{profile.rows[0].frames} frames with each setting, in turn; the first {profile.warm_up_frames} of each are "
         f"not timed, {timed} are." + ("" if timed >= 100 else " Of fewer than 100 the p99 is all but the largest."),
         *(f"{one}." for one in profile.merged),
+        *_busy(profile.waited),
         "",
         *_table(profile),
         "",
@@ -426,6 +438,14 @@ def markdown(profile: Profile) -> str:
         if profile.recommendation.config:
             lines += ["", "```toml", profile.recommendation.config.rstrip(), "```"]
     return "\n".join(lines) + "\n"
+
+
+def _busy(ratio: float | None) -> Iterable[str]:
+    if ratio is not None and ratio > BUSY:
+        yield (
+            f"The machine was busy: frames took {ratio:.1f} times their processor time, on an idle one about once. "
+            "Measure wall times again when it is idle; processor times, memory and accuracy hold."
+        )
 
 
 def _table(profile: Profile) -> Iterable[str]:

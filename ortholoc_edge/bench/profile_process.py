@@ -172,12 +172,13 @@ class ProfileProcess:
         assert self._process.stdin is not None and self._process.stdout is not None
         with suppress(BrokenPipeError):
             self._process.stdin.close()
-        self._process.stdout.close()
         try:
+            # It may be in the middle of a step, whose answer the pipe takes.
             self._process.wait(timeout=_END_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        self._process.stdout.close()
 
     def _answer(self, kind: type[_Answer]) -> _Answer:
         assert self._process.stdout is not None

@@ -166,6 +166,7 @@ def run(args: argparse.Namespace) -> int:
     measured = profile.Profile(
         measured=provenance(),
         load=(began, profile.load_average()),
+        waited=profile.waited(rows),
         source=str(args.frames),
         pack="its own pack" if args.pack is None else str(args.pack),
         prior="as flown" if logs else args.prior,

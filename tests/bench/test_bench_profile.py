@@ -232,6 +232,7 @@ def test_a_flight_profiled(flight: Path, tmp_path: Path, capsys: pytest.CaptureF
     # Other detail, other poses: the two were not the same run.
     assert found["rows"][0]["accuracy"]["te_m"] != found["rows"][1]["accuracy"]["te_m"]
     assert found["recommendation"]["row"] == 0
+    assert found["waited"] > 0
     assert found["merged"] == ["structural has no detail of 0.3; it is measured as 0.5"]
     assert json.loads((tmp_path / "profile.json").read_text()) == found
     text = (tmp_path / "profile.md").read_text()
@@ -249,12 +250,27 @@ def test_a_plot_of_what_has_nothing_to_compare() -> None:
     """One setting, no fix, no rate; and names that markup would misread."""
     lost = replace(row(Made(FULL, 0.4, p90_m=None)), fixes=0)
     measured = profile.Profile(
-        measured="m", load=(0.0, 0.1), source="<a&b>", pack="p", prior="odometer", seed=0, passes=1, warm_up_frames=0,
-        merged=[], rows=[lost], recommendation=None,
+        measured="m", load=(0.0, 0.1), waited=None, source="<a&b>", pack="p", prior="odometer", seed=0, passes=1,
+        warm_up_frames=0, merged=[], rows=[lost], recommendation=None,
     )  # fmt: skip
     assert "&lt;a&amp;b&gt;" in profile_svg(measured)
     ET.fromstring(profile_svg(measured))
     assert "| - / - |" in profile.markdown(measured)
+    assert "busy" not in profile.markdown(measured)
+
+
+def test_a_busy_machine_is_told_by_the_time_that_frames_waited() -> None:
+    idle, busy = row(Made(FULL, 90.0, cpu_ms=60.0)), row(Made(HALF, 90.0, cpu_ms=20.0))
+    assert profile.waited([busy]) == 3.0
+    # What one setting could do, the machine can.
+    assert profile.waited([busy, idle]) == 1.0
+    # A frame may wait for another device.
+    assert profile.waited([replace(busy, setting=XFEAT)]) is None
+    said = profile.Profile(
+        measured="m", load=(9.0, 9.0), waited=3.0, source="s", pack="p", prior="odometer", seed=0, passes=1,
+        warm_up_frames=3, merged=[], rows=[busy], recommendation=None,
+    )  # fmt: skip
+    assert "frames took 3.0 times their processor time" in profile.markdown(said)
 
 
 @pytest.mark.parametrize(
