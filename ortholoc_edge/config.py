@@ -22,6 +22,7 @@ from ortholoc_edge.geometry import frames, rotation
 from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.rigid import Rigid3
+from ortholoc_edge.matching.providers import ProviderName
 from ortholoc_edge.matching.types import STRUCTURAL
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
 from ortholoc_edge.pipeline.navigator import TimingOptions
@@ -146,8 +147,8 @@ class MatcherOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """Which matcher: "structural" needs no model; "structural+xfeat" takes XFeat for frames that it can't place.
 
     The others are for matchers of features. ``model``: a file instead of the built one; ``model_sha256``: what it must
-    hash to. ``working_px``: long side at which frames are matched: time grows with its square. A multiple of 32 for
-    xfeat.
+    hash to. ``provider``: what computes the networks, of those that the installed ONNX Runtime has. ``working_px``:
+    long side at which frames are matched: time grows with its square. A multiple of 32 for xfeat.
     """
 
     name: str = "structural"
@@ -156,6 +157,7 @@ class MatcherOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     threads: Annotated[int, Meta(ge=1, le=64)] = 1
     model: str | None = None
     model_sha256: str | None = None
+    provider: ProviderName = "cpu"
 
     def __post_init__(self) -> None:
         if "xfeat" in self.name and self.working_px % _XFEAT_MULTIPLE_PX:

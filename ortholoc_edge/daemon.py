@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +27,7 @@ from ortholoc_edge.config import Config, MatcherOptions, config_text
 from ortholoc_edge.errors import CameraError, LinkError, MapError, OrtholocError
 from ortholoc_edge.matching.registry import make_method
 from ortholoc_edge.matching.types import AnyMatcher
+from ortholoc_edge.pipeline import structural
 from ortholoc_edge.pipeline.frame import Frame, VehicleState
 from ortholoc_edge.pipeline.localizer import Localizer
 from ortholoc_edge.pipeline.navigator import Circumstances, Navigator
@@ -358,16 +359,22 @@ def configured_matcher(options: MatcherOptions) -> AnyMatcher:
         threads=options.threads,
         model_path=None if options.model is None else Path(options.model),
         model_sha256=options.model_sha256,
+        provider=options.provider,
     )
 
 
 def make_navigator(
-    config: Config, store: MapStore, matcher: AnyMatcher, first_reset_counter: int, budget_ms: float | None
+    config: Config,
+    store: MapStore,
+    matcher: AnyMatcher,
+    first_reset_counter: int,
+    budget_ms: float | None,
+    ladder: Sequence[structural.Tuning] = structural.LADDER,
 ) -> Navigator:
     """Localizer and tracker as configured; the caller closes the localizer."""
     fixed = config.mount.body_from_camera() if config.mount.gimbal_selection() is None else None
     return Navigator(
-        Localizer(config.intrinsics.camera(), store, matcher, config.localizer),
+        Localizer(config.intrinsics.camera(), store, matcher, config.localizer, ladder),
         Tracker(store.pack.georeference, fixed, config.tracker, first_reset_counter, config.witness),
         budget_ms,
     )

@@ -125,14 +125,14 @@ class LocalizerProcess:
 def serve() -> None:
     """What `LocalizerProcess` runs: answers a line of a photo and its prior's errors by the figures of that frame."""
     ask = json.loads(sys.argv[1])
-    imported = _memory_mb()[0]
+    imported = memory_mb()[0]
     matcher = make_method(ask["matcher"], working_px=640, max_keypoints=4096, threads=1)
     recorded = sequence.read_flight(Path(ask["flight"]))
-    with_model = _memory_mb()[0]
+    with_model = memory_mb()[0]
     pack = Pack.open(Path(ask["pack"]))
     localizers: dict[Camera, Localizer] = {}
     with MapStore(pack, features=ask["features"], cache_bytes=ask["cache"], memory_bytes=ANY_BYTES) as store:
-        _say(imported_mb=imported, model_mb=with_model, pack_mb=_memory_mb()[0],
+        _say(imported_mb=imported, model_mb=with_model, pack_mb=memory_mb()[0],
              compressed_mb=store.compressed_bytes / _MB, km2=pack_km2(pack), frames=len(recorded))  # fmt: skip
         for line in sys.stdin:
             index, errors = json.loads(line)
@@ -158,7 +158,7 @@ def _stepped(
     wall, cpu = time.perf_counter(), time.process_time()
     outcome = localizer.localize(frame, prior)
     cpu_ms, wall_ms = (time.process_time() - cpu) * 1e3, (time.perf_counter() - wall) * 1e3
-    rss, peak = _memory_mb()
+    rss, peak = memory_mb()
     te_m = metrics.pose_error(outcome, truth).te_m if isinstance(outcome, Fix) else None
     return {"cpu_ms": cpu_ms, "wall_ms": wall_ms, "rss_mb": rss, "peak_mb": peak, "te_m": te_m}
 
@@ -168,7 +168,7 @@ def _say(**facts: Any) -> None:
     sys.stdout.flush()
 
 
-def _memory_mb() -> tuple[float, float]:
+def memory_mb() -> tuple[float, float]:
     """Resident memory of this process and the highest it was (MB of 10^6), as the kernel counts."""
     found = {}
     for line in Path("/proc/self/status").read_text().splitlines():

@@ -18,7 +18,7 @@ EXIT_CONFIG = 78  # EX_CONFIG: systemd's RestartPreventExitStatus, a restart can
 # Each in the module of its name.
 _COMMANDS = (
     "sim", "run", "doctor", "replay", "localize", "calibrate-focal", "tiles", "models", "samples", "bench",
-    "bench-replay", "bench-core", "bench-link", "bench-packs",
+    "bench-replay", "bench-core", "bench-link", "bench-packs", "profile",
 )  # fmt: skip
 
 

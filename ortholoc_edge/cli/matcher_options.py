@@ -8,6 +8,7 @@ from pathlib import Path
 from ortholoc_edge.cli.arguments import positive_int
 from ortholoc_edge.cli.progress import ProgressBar
 from ortholoc_edge.config import MatcherOptions
+from ortholoc_edge.matching import providers
 from ortholoc_edge.matching.registry import METHODS, RANDOM, make_method
 from ortholoc_edge.matching.types import STRUCTURAL, AnyMatcher
 
@@ -38,9 +39,19 @@ def add(parser: argparse.ArgumentParser, default: str = STRUCTURAL) -> None:
     group.add_argument(
         "--threads", type=positive_int, default=1, help="threads of one inference (default: %(default)s)"
     )
+    add_provider(group)
     group.add_argument("--model", type=Path, metavar="FILE", help="an ONNX file instead of the built model; for xfeat")
     group.add_argument("--model-sha256", metavar="HASH", help="refuse --model unless it has this SHA-256")
     group.add_argument("--no-adhop", action="store_true", help="one matching round only")
+
+
+def add_provider(group: argparse._ActionsContainer) -> None:
+    group.add_argument(
+        "--provider",
+        choices=providers.NAMES,
+        default=providers.CPU,
+        help="what computes a matcher's networks, of what the installed onnxruntime has (default: %(default)s)",
+    )
 
 
 def add_features(parser: argparse.ArgumentParser) -> None:
@@ -63,6 +74,7 @@ def settings(args: argparse.Namespace) -> MatcherOptions:
         threads=args.threads,
         model=None if args.model is None else str(args.model),
         model_sha256=args.model_sha256,
+        provider=args.provider,
     )
 
 
@@ -76,6 +88,7 @@ def matcher(args: argparse.Namespace) -> AnyMatcher:
             threads=args.threads,
             model_path=args.model,
             model_sha256=args.model_sha256,
+            provider=args.provider,
             progress=bar.step,
             random_weights=args.matcher in RANDOM,
         )

@@ -12,11 +12,12 @@ import onnxruntime as ort
 
 from ortholoc_edge.errors import ModelError
 from ortholoc_edge.geometry.arrays import Float32Array
+from ortholoc_edge.matching import providers
 from ortholoc_edge.matching.models import check_hash
 
 
 class Inference:
-    """A session of its own for one graph.
+    """A session of its own for one graph, computed by the provider in force (`providers.computed_by`).
 
     Args:
         graph: ONNX bytes; or a file, whose hash the caller has compared (weights beyond protobuf's limit lie in a
@@ -53,12 +54,13 @@ class Inference:
             self._session = ort.InferenceSession(
                 graph if isinstance(graph, bytes) else str(graph),
                 _options(threads),
-                providers=["CPUExecutionProvider"],
+                providers=providers.for_session(threads),
             )
         except Exception as err:
             raise ModelError(
                 f"{what} graph can't be loaded by onnxruntime {ort.__version__} ({err}); {self._remedy}"
             ) from err
+        providers.check_taken(self._session.get_providers(), what)
         self.input_shapes = {entry.name: tuple(entry.shape) for entry in self._session.get_inputs()}
         found_in = self.inputs
         found_out = {entry.name for entry in self._session.get_outputs()}
@@ -92,7 +94,7 @@ class Inference:
 
 def _options(threads: int) -> Any:
     options = ort.SessionOptions()
-    options.intra_op_num_threads = threads
+    options.intra_op_num_threads = providers.session_threads(threads)
     options.inter_op_num_threads = 1
     options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
     options.use_deterministic_compute = True

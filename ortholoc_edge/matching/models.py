@@ -35,6 +35,7 @@ import numpy as np
 
 from ortholoc_edge.errors import ModelError
 from ortholoc_edge.geometry.arrays import Float32Array, FloatArray, ImageArray, IntArray
+from ortholoc_edge.matching import providers
 from ortholoc_edge.matching.torch_checkpoint import read_checkpoint
 
 logger = logging.getLogger(__name__)
@@ -716,7 +717,8 @@ def verify(
     # Written so that a NaN fails, too.
     if not all(difference <= REFERENCE_TOLERANCE for difference in differences.values()):
         raise ModelError(
-            f"{what} differs from the published {name} by {differences}, limit {REFERENCE_TOLERANCE}; {remedy}"
+            f"{what} differs from the published {name} by {differences}, limit {REFERENCE_TOLERANCE}, computed by "
+            f"{providers.chosen()}; {remedy}"
         )
     return differences
 

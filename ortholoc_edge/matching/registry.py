@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from ortholoc_edge.errors import ConfigError
-from ortholoc_edge.matching import models
+from ortholoc_edge.matching import models, providers
 from ortholoc_edge.matching.binary import BinaryMatcher
 from ortholoc_edge.matching.exported import EXPORTED, RANDOM_SUFFIX, load
 from ortholoc_edge.matching.sift import SiftMatcher
@@ -36,6 +36,7 @@ def make_method(
     threads: int,
     model_path: Path | None = None,
     model_sha256: str | None = None,
+    provider: str = providers.CPU,
     progress: models.Progress | None = None,
     random_weights: bool = False,
 ) -> AnyMatcher:
@@ -43,6 +44,7 @@ def make_method(
     if name not in METHODS and not (name in RANDOM and random_weights):
         raise ConfigError(f"matcher {name!r} is not known; known are: {', '.join(METHODS)}")
     if name == STRUCTURAL:
+        _without_network(name, provider)
         if model_path is not None or model_sha256 is not None:
             raise ConfigError(f"matcher {name!r} uses no model; leave it away")
         return Structural()
@@ -54,6 +56,7 @@ def make_method(
         threads=threads,
         model_path=model_path,
         model_sha256=model_sha256,
+        provider=provider,
         progress=progress,
         random_weights=random_weights,
     )
@@ -68,6 +71,7 @@ def make_matcher(
     threads: int,
     model_path: Path | None = None,
     model_sha256: str | None = None,
+    provider: str = providers.CPU,
     progress: models.Progress | None = None,
     random_weights: bool = False,
 ) -> Matcher:
@@ -81,10 +85,11 @@ def make_matcher(
         threads: of one inference; SIFT, ORB and AKAZE take OpenCV's setting (``cv2.setNumThreads``).
         model_path: a model file instead of the store's; not for matchers that run several.
         model_sha256: hash that the file must have; None: the record beside the file says it.
+        provider: one of `providers.NAMES`, which computes the networks.
         progress: told of a build's steps.
         random_weights: whether one of ``RANDOM`` may be named: what tests a path, and must not fly.
-    Raises: ConfigError for an unknown name, a number out of range or a model where none is used;
-        ModelError if the model can't be had.
+    Raises: ConfigError for an unknown name, a number out of range, a provider that is not installed, or a model or a
+        provider where no network is run; ModelError if the model can't be had.
     """
     if name in RANDOM and not random_weights:
         raise ConfigError(
@@ -96,6 +101,8 @@ def make_matcher(
     if model_path is None and model_sha256 is not None:
         raise ConfigError("a model's SHA-256 was given without the model's file; give both or none")
     try:
+        if not runs_network(name):
+            _without_network(name, provider)
         if name == "sift":
             if model_path is not None:
                 raise ConfigError(f"matcher 'sift' uses no model; leave {model_path} away")
@@ -104,30 +111,43 @@ def make_matcher(
             if model_path is not None:
                 raise ConfigError(f"matcher {name!r} uses no model; leave {model_path} away")
             return BinaryMatcher(name, working_px=working_px, max_keypoints=max_keypoints)
-        if name in EXPORTED or name in RANDOM:
-            if model_path is not None:
-                raise ConfigError(f"matcher {name!r} is taken from the store only; leave {model_path} away")
-            return _exported(name, working_px, max_keypoints, threads)
-        if name in _PAIRED:
-            if model_path is not None:
-                raise ConfigError(
-                    f"matcher {name!r} runs several models, {model_path} can't stand for all; leave it away and have "
-                    f"them in ${models.STORE_VARIABLE}/models"
-                )
-            return _paired(name, working_px, max_keypoints, threads, progress)
-        # Not at the top: SIFT must work where the inference runtime does not.
-        from ortholoc_edge.matching.xfeat import XFeatMatcher
+        if (name in EXPORTED or name in RANDOM) and model_path is not None:
+            raise ConfigError(f"matcher {name!r} is taken from the store only; leave {model_path} away")
+        if name in _PAIRED and model_path is not None:
+            raise ConfigError(
+                f"matcher {name!r} runs several models, {model_path} can't stand for all; leave it away and have "
+                f"them in ${models.STORE_VARIABLE}/models"
+            )
+        with providers.computed_by(provider):
+            if name in EXPORTED or name in RANDOM:
+                return _exported(name, working_px, max_keypoints, threads)
+            if name in _PAIRED:
+                return _paired(name, working_px, max_keypoints, threads, progress)
+            # Not at the top: SIFT must work where the inference runtime does not.
+            from ortholoc_edge.matching.xfeat import XFeatMatcher
 
-        model = (
-            models.ensure(name, progress)
-            if model_path is None
-            else models.load_file(model_path, model_sha256)
-        )
-        return XFeatMatcher(
-            model.graph, model.sha256, working_px=working_px, max_keypoints=max_keypoints, threads=threads
-        )
+            model = (
+                models.ensure(name, progress)
+                if model_path is None
+                else models.load_file(model_path, model_sha256)
+            )
+            return XFeatMatcher(
+                model.graph, model.sha256, working_px=working_px, max_keypoints=max_keypoints, threads=threads
+            )
     except ValueError as err:
         raise ConfigError(f"matcher {name}: {err}") from err
+
+
+def runs_network(method: str) -> bool:
+    """Whether one of ``METHODS`` has a network to compute."""
+    return method.removeprefix(f"{STRUCTURAL}+") not in (STRUCTURAL, "sift", *BINARY)
+
+
+def _without_network(name: str, provider: str) -> None:
+    if provider != providers.CPU:
+        raise ConfigError(
+            f"matcher {name!r} runs no network that provider {provider!r} could compute; leave the provider away"
+        )
 
 
 def _paired(

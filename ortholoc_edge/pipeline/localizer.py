@@ -181,7 +181,7 @@ class Localizer:
         self._worker.shutdown()
 
     def warm_up(self) -> None:
-        """Extract from a picture, so that what is allocated and compiled at first use is ready.
+        """Extract from a picture and match it with itself: what is allocated and compiled at first use is ready then.
 
         Raises: ModelError if the matcher itself fails.
         """
@@ -192,7 +192,8 @@ class Localizer:
         for tracking in self._tracking:
             tracking.fields(picture)
         if self._acquire is not None:
-            self._acquire.extract(picture)
+            features = self._acquire.extract(picture)
+            self._acquire.match(features, features)
 
     @property
     def matcher(self) -> Matcher:

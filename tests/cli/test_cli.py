@@ -65,7 +65,7 @@ def position(truth: Rigid3 = TRUTH, off_m: tuple[float, float, float] = (3.0, -2
 HELP = [
     ["sim"], ["run"], ["doctor"], ["replay"], ["localize"], ["bench"], ["bench-replay"], ["models", "build"],
     ["models", "list"], ["tiles", "build"], ["tiles", "info"], ["tiles", "verify"], ["samples", "make"],
-    ["samples", "simulate"], ["samples", "draw"],
+    ["samples", "simulate"], ["samples", "draw"], ["profile"],
 ]  # fmt: skip
 # Their only arguments are required, or there are none.
 WITHOUT_DEFAULTS = ("run", "tiles verify", "samples draw")

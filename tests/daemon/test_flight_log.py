@@ -477,6 +477,18 @@ def test_another_pack_is_refused(flown_log: Path, tmp_path: Path, capsys: pytest
     assert "not the pack that was flown with" in capsys.readouterr().err
 
 
+def test_a_log_is_profiled_against_its_full_detail(flown_log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--scales", "1,0.5", "--matcher", "sift", "--passes", "1", "--warm-up", "1", "--json"]
+    assert main(["profile", "--frames", str(flown_log), *words]) == 0
+    found = json.loads(capsys.readouterr().out)
+    full, half = found["rows"]
+    assert full["frames"] == half["frames"] >= 5
+    assert (full["accuracy"], full["agreement"], half["accuracy"]) == (None, None, None)
+    assert 0 <= half["agreement"]["same_verdict"] <= 1
+    assert (full["setting"]["working_px"], half["setting"]["working_px"]) == (640, 320)
+    assert "map_features" in half["stages_ms"]
+
+
 def test_thumbnails_are_no_replay(tmp_path: Path, flown_log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (path,) = flown_log.iterdir()
     header = read_header(path)
