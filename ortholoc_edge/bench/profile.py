@@ -20,7 +20,7 @@ from msgspec import Struct
 from ortholoc_edge.bench.metrics import FALSE_FIX_DEG, FALSE_FIX_M, RECALL_LIMITS, Latency, PoseError, Spread, recall
 from ortholoc_edge.bench.profile_process import Flown, ProfileProcess, Setting, Source, Started
 from ortholoc_edge.errors import ConfigError, OrtholocError
-from ortholoc_edge.matching.registry import runs_network
+from ortholoc_edge.matching.registry import runs_network, takes_working_px
 from ortholoc_edge.matching.types import STRUCTURAL
 from ortholoc_edge.pipeline import structural
 
@@ -160,7 +160,8 @@ def settings(
     """What is to be measured, the most detailed of each matcher first; and what of it is the same and measured once.
 
     A scale is of the resolution at which frames are matched: of ``working_px`` for a matcher of features, in steps that
-    its network takes; of structural matching the rung of its ladder that has that detail or more.
+    its network takes (none, of a network that has a size of its own); of structural matching the rung of its ladder
+    that has that detail or more.
     Raises: ConfigError for a scale that leaves too little.
     """
     found: dict[tuple[str, int, int, int | None], Setting] = {}
@@ -191,7 +192,7 @@ def _setting(name: str, scale: float, threads: int, working_px: int, max_keypoin
             # Scales are written with few digits.
             if detail > scale - 1e-3:
                 rung, reached = number, detail
-    if name == STRUCTURAL:
+    if not takes_working_px(name):
         return Setting(name, reached, threads, provider, rung, None, max_keypoints)
     step = _MULTIPLE_PX if runs_network(name) else 1
     px = round(scale * working_px / step) * step

@@ -48,7 +48,7 @@ class Setting(Struct, frozen=True):
         scale: resolution at which frames are matched, over full detail's.
         threads: of one inference.
         rung: of structural matching's ladder.
-        working_px: of the matcher of features; None of structural matching alone.
+        working_px: of the matcher of features; None of structural matching alone, and of one that has its own.
     """
 
     matcher: str
@@ -69,7 +69,7 @@ class Setting(Struct, frozen=True):
         """Long sides at which frames are matched."""
         tracked = [structural.LADDER[self.rung].levels[-1].long_px] if self.matcher.startswith(STRUCTURAL) else []
         features = [] if self.working_px is None else [self.working_px]
-        return " + ".join(map(str, tracked + features))
+        return " + ".join(map(str, tracked + features)) or "its own"
 
     @property
     def label(self) -> str:
@@ -206,7 +206,7 @@ def _serve(setting: Setting, source: Source) -> None:
     start = time.perf_counter()
     matcher = make_method(
         setting.matcher,
-        # Structural matching alone takes no notice of it.
+        # Those that have none take no notice of it.
         working_px=setting.working_px or 640,
         max_keypoints=setting.max_keypoints,
         threads=setting.threads,

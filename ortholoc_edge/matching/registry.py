@@ -103,13 +103,10 @@ def make_matcher(
     try:
         if not runs_network(name):
             _without_network(name, provider)
-        if name == "sift":
-            if model_path is not None:
-                raise ConfigError(f"matcher 'sift' uses no model; leave {model_path} away")
-            return SiftMatcher(working_px=working_px, max_keypoints=max_keypoints)
-        if name in BINARY:
             if model_path is not None:
                 raise ConfigError(f"matcher {name!r} uses no model; leave {model_path} away")
+            if name == "sift":
+                return SiftMatcher(working_px=working_px, max_keypoints=max_keypoints)
             return BinaryMatcher(name, working_px=working_px, max_keypoints=max_keypoints)
         if (name in EXPORTED or name in RANDOM) and model_path is not None:
             raise ConfigError(f"matcher {name!r} is taken from the store only; leave {model_path} away")
@@ -141,6 +138,12 @@ def make_matcher(
 def runs_network(method: str) -> bool:
     """Whether one of ``METHODS`` has a network to compute."""
     return method.removeprefix(f"{STRUCTURAL}+") not in (STRUCTURAL, "sift", *BINARY)
+
+
+def takes_working_px(method: str) -> bool:
+    """Whether one of ``METHODS`` has a matcher whose resolution can be chosen: some networks have one of their own."""
+    name = method.removeprefix(f"{STRUCTURAL}+")
+    return name != STRUCTURAL and (name not in EXPORTED or EXPORTED[name].family == "superpoint")
 
 
 def _without_network(name: str, provider: str) -> None:

@@ -58,6 +58,10 @@ def test_a_scale_of_features_is_a_size_that_the_network_takes() -> None:
     assert (found[1].scale, merged) == (0.55, [])
     both, _ = asked(["structural+sift"], [0.5])
     assert (both[0].rung, both[0].working_px, both[0].px) == (2, 320, "256 + 320")
+    # A network whose picture has a size of its own.
+    fixed, merged = asked(["mast3r"], [1.0, 0.5])
+    assert [(one.scale, one.working_px, one.label) for one in fixed] == [(1.0, None, "mast3r at its own px")]
+    assert merged == ["mast3r has no detail of 0.5; it is measured as 1"]
     with pytest.raises(ConfigError, match=r"scale 0\.1 of --working-px 640 is 64 px; .* needs 128"):
         asked(["xfeat"], [0.1])
 
