@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -226,6 +227,35 @@ def read_config(path: Path) -> Config:
 def config_text(config: Config) -> str:
     """As JSON, for `config_from_text`; infinite numbers, which only programs set, are written as Infinity."""
     return json.dumps(msgspec.to_builtins(config))
+
+
+def without_secrets(config: Config) -> dict[str, Any]:
+    """As plain values, for others to read: without names and passwords in addresses, and without where keys are."""
+    plain: dict[str, Any] = _masked(json.loads(config_text(config)))
+    return plain
+
+
+# In tables of any depth.
+_SECRET_KEYS = frozenset({"signing_key", "signing_state", "private_key"})
+_LEFT_OUT = "(left out)"
+# rtsp://NAME:PASSWORD@HOST, and properties of GStreamer's sources.
+_IN_ADDRESS = re.compile(r"(://)[^/@\s]+@")
+_AS_PROPERTY = re.compile(
+    r'\b(user-id|user-pw|proxy-id|proxy-pw|password|passwd|token|secret)(\s*=\s*)("[^"]*"|\S+)'
+)
+
+
+def _masked(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {
+            name: _LEFT_OUT if name in _SECRET_KEYS and part is not None else _masked(part)
+            for name, part in value.items()
+        }
+    if isinstance(value, list):
+        return [_masked(part) for part in value]
+    if isinstance(value, str):
+        return _AS_PROPERTY.sub(rf"\1\2{_LEFT_OUT}", _IN_ADDRESS.sub(rf"\1{_LEFT_OUT}@", value))
+    return value
 
 
 def config_from_text(text: str) -> Config:

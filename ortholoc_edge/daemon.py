@@ -9,6 +9,7 @@ Frames never queue: a position three frames old misleads by an amount that nobod
 from __future__ import annotations
 
 import logging
+import os
 import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -20,10 +21,13 @@ from typing import Generic, TypeVar
 from ortholoc_edge.adapters import systemd
 from ortholoc_edge.adapters.bus import Bus
 from ortholoc_edge.adapters.camera import BadFrameError, EndOfFrames, FrameSource, open_source
+from ortholoc_edge.adapters.commands import Answer, BusyError, Desk
 from ortholoc_edge.adapters.flight_log import FlightLog
 from ortholoc_edge.adapters.mavlink import AutopilotLink, Statistic, SystemStatus
+from ortholoc_edge.adapters.messages import NAME_OF_COMMAND, Command, CommandReply, ConfigMessage
 from ortholoc_edge.clock import Clock, SystemClock, wall_clock_ns
-from ortholoc_edge.config import Config, MatcherOptions, config_text
+from ortholoc_edge.commander import Commander
+from ortholoc_edge.config import Config, MatcherOptions, config_text, without_secrets
 from ortholoc_edge.errors import CameraError, LinkError, MapError, OrtholocError
 from ortholoc_edge.matching.registry import make_method
 from ortholoc_edge.matching.types import AnyMatcher
@@ -48,6 +52,8 @@ _S = 1_000_000_000
 
 _WAIT_S = 0.2
 _MAX_ERRORS_IN_A_ROW = 5
+# A frame that is searched for takes a second at most (`[timing] max_age_ms`).
+_COMMAND_WAIT_S = 5.0
 # A read returns within `_WAIT_S`; a driver that holds it this long is not coming back by itself.
 _CAPTURE_HUNG_NS = 5_000_000_000
 
@@ -123,6 +129,8 @@ class Daemon:
         self._config = config
         self._clock = clock or SystemClock()
         self._counts: Counter[str] = Counter()
+        self._slot: LatestSlot[Frame | _Missed] = LatestSlot()
+        self._desk = Desk()
         public_key = None if config.map.public_key is None else Path(config.map.public_key)
         with ExitStack() as resources:
             # Closed in reverse, also where a later part can't be had.
@@ -150,8 +158,24 @@ class Daemon:
             self._vehicle = Vehicle(
                 self._link, tracker, georeference, config.mount, config.attitude, self._clock, self._counts
             )
-            bus = resources.enter_context(closing(Bus(config.bus))) if config.bus.enabled else None
             log = resources.enter_context(closing(self._flight_log(config))) if config.log.folder else None
+            self._commander = Commander(
+                self._navigator,
+                self._store,
+                self._link,
+                self._clock,
+                self._counts,
+                self.statistics,
+                lost_sigma_m=config.tracker.lost_sigma_m,
+                log=log,
+                snapshots=_snapshot_folder(config),
+            )
+            credentials = os.environ.get("CREDENTIALS_DIRECTORY")
+            self._bus = (
+                resources.enter_context(closing(Bus(config.bus, Path(credentials) if credentials else None)))
+                if config.bus.enabled
+                else None
+            )
             self._reporter = Reporter(
                 self._link,
                 config.link,
@@ -160,20 +184,50 @@ class Daemon:
                 self._navigator,
                 self._store,
                 self._counts,
-                bus=bus,
+                self._commander,
+                replaced=lambda: self._slot.replaced,
+                unix_minus_stamp_ns=self._unix_minus_stamp_ns,
+                bus=self._bus,
                 log=log,
                 on_outcome=on_outcome,
             )
             self._frames = resources.enter_context(closing(frames or open_source(config.camera, self._clock)))
             self._resources = resources.pop_all()
-        self._slot: LatestSlot[Frame | _Missed] = LatestSlot()
         self._ended = threading.Event()
         self._capture_failure: BaseException | None = None
         self._capture_beat_ns = self._clock.now_ns()
 
-    def _flight_log(self, config: Config) -> FlightLog:
+    def _unix_minus_stamp_ns(self) -> int:
         # A clock that somebody sets, in simulation, is its own date.
-        real = isinstance(self._clock, SystemClock)
+        return wall_clock_ns() - self._clock.now_ns() if isinstance(self._clock, SystemClock) else 0
+
+    def _serve_bus(self, bus: Bus) -> None:
+        bus.serve(
+            {
+                "config": lambda: ConfigMessage(config=without_secrets(self._config)),
+                "stats": lambda: self._reporter.stats(self._clock.now_ns()),
+            },
+            self._on_command,
+        )
+
+    def _on_command(self, command: Command) -> Answer:
+        """In a thread of the bus."""
+        try:
+            return self._desk.ask(lambda: self._carry_out(command), _COMMAND_WAIT_S)
+        except BusyError as error:
+            return CommandReply(
+                command=NAME_OF_COMMAND[type(command)],
+                accepted=False,
+                reason=f"the frame path is busy: {error}",
+                remedy="ask again",
+            )
+
+    def _carry_out(self, command: Command) -> Answer:
+        answer = self._commander.carry_out(command)
+        self._reporter.publish_state(self._clock.now_ns())
+        return answer
+
+    def _flight_log(self, config: Config) -> FlightLog:
         now_ns = self._clock.now_ns()
         return FlightLog(
             config.log,
@@ -186,7 +240,7 @@ class Daemon:
                 "model_sha256": self._matcher.model_sha256,
             },
             started_ns=now_ns,
-            unix_minus_stamp_ns=wall_clock_ns() - now_ns if real else 0,
+            unix_minus_stamp_ns=self._unix_minus_stamp_ns(),
         )
 
     @property
@@ -202,8 +256,8 @@ class Daemon:
         self._resources.close()
 
     def statistics(self) -> dict[str, Statistic]:
-        """See :meth:`Reporter.statistics`; and how many frames a newer one took the place of."""
-        return {**self._reporter.statistics(), "frames_replaced": self._slot.replaced}
+        """See :meth:`Reporter.statistics`."""
+        return self._reporter.statistics()
 
     def run(self, stop: threading.Event) -> None:
         """Work until ``stop`` is set or the frames end, then release everything; once only.
@@ -220,6 +274,8 @@ class Daemon:
             resources.callback(self._join_capture, capture, stop)
             self._capture_beat_ns = self._clock.now_ns()
             capture.start()
+            if self._bus is not None:
+                self._serve_bus(self._bus)
             resources.callback(systemd.notify, "STOPPING=1")
             systemd.notify("READY=1")
             logger.info(
@@ -273,6 +329,7 @@ class Daemon:
             # Before the slot is looked at: what came before the end must still be taken.
             ended = self._ended.is_set()
             item = self._slot.take(_WAIT_S)
+            self._desk.serve()
             self.report()
             if item is None:
                 if ended:
@@ -280,6 +337,9 @@ class Daemon:
                 continue
             if isinstance(item, _Missed):
                 self._reporter.publish(None, Rejected(item.stamp_ns, Reason.BAD_FRAME, item.why))
+                continue
+            if self._commander.paused:
+                self._reporter.publish(item, Rejected(item.stamp_ns, Reason.PAUSED, "by command; send resume"))
                 continue
             try:
                 self._handle(item, stop)
@@ -343,11 +403,21 @@ class Daemon:
                 outcome = replace(late, timings_ms=outcome.timings_ms)
             else:
                 self._vehicle.tell(outcome, localized.state)
-        self._reporter.publish(frame, outcome, (localized.outcome, localized.state, localized.circumstances))
+        step = localized.outcome, localized.state, localized.circumstances
+        self._reporter.publish(frame, outcome, step)
+        self._commander.note(frame, outcome, step)
         return outcome
 
     def _age_ms(self, stamp_ns: int) -> float:
         return (self._clock.now_ns() - stamp_ns) / 1e6
+
+
+def _snapshot_folder(config: Config) -> Path | None:
+    if config.log.folder is not None:
+        return Path(config.log.folder) / "snapshots"
+    # systemd separates several by colons.
+    state = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
+    return Path(state) / "snapshots" if state else None
 
 
 def configured_matcher(options: MatcherOptions) -> AnyMatcher:

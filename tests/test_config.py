@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from ortholoc_edge.adapters.bus import Bus, BusOptions
+from ortholoc_edge.adapters.messages import rejection_message
 from ortholoc_edge.config import read_config, read_intrinsics
 from ortholoc_edge.errors import ConfigError, LinkError
 from ortholoc_edge.matching.registry import make_method
@@ -170,7 +171,7 @@ def test_a_malformed_endpoint_is(endpoint: str) -> None:
 
 def test_outcomes_that_were_not_published_are_counted() -> None:
     bus = Bus(BusOptions(enabled=True, listen=("tcp/127.0.0.1:0",)))
-    bus.publish(Rejected(1, Reason.LATE))
+    bus.publish(rejection_message(Rejected(1, Reason.LATE), 1))
     assert bus.dropped == 0
     bus.close()
     bus.publish(Rejected(2, Reason.LATE))

@@ -30,10 +30,10 @@ from mcap.reader import make_reader
 from replay import rendered
 
 from ortholoc_edge.adapters import systemd
-from ortholoc_edge.adapters.bus import AutopilotRecord
 from ortholoc_edge.adapters.camera import CameraOptions, EndOfFrames, FrameSource, open_source
 from ortholoc_edge.adapters.flight_log import LogOptions
 from ortholoc_edge.adapters.mavlink import SystemStatus
+from ortholoc_edge.adapters.messages import AutopilotMessage
 from ortholoc_edge.clock import SystemClock
 from ortholoc_edge.config import Config, MountOptions
 from ortholoc_edge.daemon import Daemon, LatestSlot
@@ -359,16 +359,18 @@ def test_spoofed_gnss_is_told_and_the_source_switched_where_enabled(folder: Path
 class _Bus:
     """Keeps what is published of the autopilot."""
 
-    dropped = 0
+    dropped = refused = 0
+    accepts_commands = False
 
     def __init__(self) -> None:
-        self.records: list[AutopilotRecord] = []
+        self.records: list[AutopilotMessage] = []
 
-    def publish(self, outcome: Outcome) -> None:
+    def publish(self, message: Any) -> None:
+        if isinstance(message, AutopilotMessage):
+            self.records.append(message)
+
+    def publish_image(self, stamp_ns: int, image: Any) -> None:
         pass
-
-    def publish_autopilot(self, record: AutopilotRecord) -> None:
-        self.records.append(record)
 
 
 def test_a_lost_link_is_published(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
