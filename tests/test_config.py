@@ -174,5 +174,5 @@ def test_outcomes_that_were_not_published_are_counted() -> None:
     bus.publish(rejection_message(Rejected(1, Reason.LATE), 1))
     assert bus.dropped == 0
     bus.close()
-    bus.publish(Rejected(2, Reason.LATE))
+    bus.publish(rejection_message(Rejected(2, Reason.LATE), 2))
     assert bus.dropped == 1

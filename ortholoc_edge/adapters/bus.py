@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct, field
 
-from ortholoc_edge.adapters.commands import MOST_BYTES, Answer, CommandError, parse_command
+from ortholoc_edge.adapters.commands import Answer, CommandError, parse_command
 from ortholoc_edge.adapters.messages import (
     ASKED,
     JSON,
@@ -267,7 +267,7 @@ class Bus:
 
     def _obey(self, query: zenoh.Query) -> None:
         name = str(query.key_expr).rpartition("/")[2]
-        payload = b"" if query.payload is None else query.payload
+        payload = b"" if query.payload is None else query.payload.to_bytes()
         encoding = "" if query.encoding is None else str(query.encoding)
         is_malformed = False
         try:
@@ -276,10 +276,7 @@ class Bus:
                     name[:64], f"asked of {str(query.key_expr)[:128]!r}, which may be several vehicles",
                     f"ask {self._prefix}/command/NAME",
                 )  # fmt: skip
-            # Looked at before it is copied.
-            too_long = len(payload) > MOST_BYTES
-            content = bytes(MOST_BYTES + 1) if too_long else bytes(payload)
-            reply = self._carried_out(name, parse_command(name, content, encoding, self._options.vehicle))
+            reply = self._carried_out(name, parse_command(name, payload, encoding, self._options.vehicle))
         except CommandError as error:
             reply, is_malformed = error.reply, True
         if not reply.accepted:

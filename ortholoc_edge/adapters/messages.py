@@ -6,7 +6,7 @@ moment as the system's date has it, which is wrong where the clock was never set
 
 from __future__ import annotations
 
-import math
+import json
 from typing import Annotated, Any
 
 import msgspec
@@ -230,12 +230,6 @@ class SetPrior(_Command, frozen=True, kw_only=True):
     sigma_horizontal_m: Annotated[float, Meta(ge=1, le=500)]
     sigma_vertical_m: Annotated[float, Meta(ge=1, le=500)]
 
-    def __post_init__(self) -> None:
-        for name in ("lat_deg", "lon_deg", "height_amsl_m", "sigma_horizontal_m", "sigma_vertical_m"):
-            # MessagePack has NaN, and no bound of a range holds it back.
-            if not math.isfinite(getattr(self, name)):
-                raise ValueError(f"{name} is {getattr(self, name)}; send a finite number")
-
 
 class Pause(_Command, frozen=True, kw_only=True):
     """``…/command/pause``: localize no more frames, send nothing to the autopilot."""
@@ -307,6 +301,11 @@ def schema() -> dict[str, Any]:
         },
         "$defs": components,
     }
+
+
+def schema_text() -> str:
+    """`schema` as it is published."""
+    return json.dumps(schema(), indent=2, ensure_ascii=False) + "\n"
 
 
 # -- outcomes as messages ------------------------------------------------------------------------------

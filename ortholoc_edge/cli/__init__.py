@@ -17,8 +17,9 @@ EXIT_CONFIG = 78  # EX_CONFIG: systemd's RestartPreventExitStatus, a restart can
 
 # Each in the module of its name.
 _COMMANDS = (
-    "sim", "run", "doctor", "replay", "localize", "calibrate-focal", "tiles", "models", "samples", "bench",
-    "bench-replay", "bench-core", "bench-link", "bench-packs", "profile",
+    "sim", "run", "doctor", "bus", "replay", "localize", "calibrate-focal",
+    "tiles", "models", "samples", "bench", "bench-replay", "bench-core", "bench-link", "bench-bus", "bench-packs",
+    "profile",
 )  # fmt: skip
 
 
