@@ -8,6 +8,7 @@ Frames never queue: a position three frames old misleads by an amount that nobod
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import threading
@@ -27,17 +28,18 @@ from ortholoc_edge.adapters.mavlink import AutopilotLink, Statistic, SystemStatu
 from ortholoc_edge.adapters.messages import NAME_OF_COMMAND, Command, CommandReply, ConfigMessage
 from ortholoc_edge.clock import Clock, SystemClock, wall_clock_ns
 from ortholoc_edge.commander import Commander
-from ortholoc_edge.config import Config, MatcherOptions, config_text, without_secrets
+from ortholoc_edge.config import Config, MatcherOptions, without_secrets
 from ortholoc_edge.errors import CameraError, LinkError, MapError, OrtholocError
 from ortholoc_edge.matching.registry import make_method
 from ortholoc_edge.matching.types import AnyMatcher
 from ortholoc_edge.pipeline import structural
 from ortholoc_edge.pipeline.frame import Frame, VehicleState
 from ortholoc_edge.pipeline.localizer import Localizer
-from ortholoc_edge.pipeline.navigator import Circumstances, Navigator
+from ortholoc_edge.pipeline.navigator import Circumstances, Navigator, Tuning
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.tracker import Tracker
 from ortholoc_edge.pose import pnp
+from ortholoc_edge.reload import Plan
 from ortholoc_edge.reporting import OutcomeListener, Reporter
 from ortholoc_edge.tiles.georeference import Georeference
 from ortholoc_edge.tiles.pack import Pack
@@ -56,6 +58,8 @@ _MAX_ERRORS_IN_A_ROW = 5
 _COMMAND_WAIT_S = 5.0
 # A read returns within `_WAIT_S`; a driver that holds it this long is not coming back by itself.
 _CAPTURE_HUNG_NS = 5_000_000_000
+# It comes round many times a second, and says when it waits longer.
+_LINK_HUNG_NS = 5_000_000_000
 
 
 class LatestSlot(Generic[T]):
@@ -158,7 +162,7 @@ class Daemon:
             self._vehicle = Vehicle(
                 self._link, tracker, georeference, config.mount, config.attitude, self._clock, self._counts
             )
-            log = resources.enter_context(closing(self._flight_log(config))) if config.log.folder else None
+            self._log = resources.enter_context(closing(self._flight_log(config))) if config.log.folder else None
             self._commander = Commander(
                 self._navigator,
                 self._store,
@@ -167,7 +171,7 @@ class Daemon:
                 self._counts,
                 self.statistics,
                 lost_sigma_m=config.tracker.lost_sigma_m,
-                log=log,
+                log=self._log,
                 snapshots=_snapshot_folder(config),
             )
             credentials = os.environ.get("CREDENTIALS_DIRECTORY")
@@ -188,7 +192,7 @@ class Daemon:
                 replaced=lambda: self._slot.replaced,
                 unix_minus_stamp_ns=self._unix_minus_stamp_ns,
                 bus=self._bus,
-                log=log,
+                log=self._log,
                 on_outcome=on_outcome,
             )
             self._frames = resources.enter_context(closing(frames or open_source(config.camera, self._clock)))
@@ -227,13 +231,36 @@ class Daemon:
         self._reporter.publish_state(self._clock.now_ns())
         return answer
 
+    def take_over(self, plan: Plan) -> None:
+        """Go on with another configuration from the next frame on; in any thread, which waits for it.
+
+        Raises: BusyError where the frame path does not come to it; then nothing has changed.
+        """
+        self._desk.ask(lambda: self._take_over(plan), _COMMAND_WAIT_S)
+
+    def _take_over(self, plan: Plan) -> None:
+        before, self._config = self._config, plan.config
+        tuning = tuning_of(plan.config)
+        if tuning != tuning_of(before):
+            self._navigator.retune(tuning)
+        self._navigator.ladder.allow(plan.config.timing.budget_ms)
+        self._vehicle.retune(plan.config.attitude)
+        self._commander.lost_sigma_m = plan.config.tracker.lost_sigma_m
+        if self._log is not None:
+            self._log.limit(plan.config.log.max_mb)
+        if self._bus is not None:
+            self._bus.retune(plan.config.bus)
+        self._counts["reloads"] += 1
+        self._reporter.remark = f"restart needed for {', '.join(plan.refused)}" if plan.refused else ""
+
     def _flight_log(self, config: Config) -> FlightLog:
         now_ns = self._clock.now_ns()
         return FlightLog(
             config.log,
             self._store.pack.georeference,
             {
-                "config": config_text(config),
+                # A log is handed around.
+                "config": json.dumps(without_secrets(config)),
                 "pack": config.map.pack,
                 "pack_sha256": self._store.pack.manifest_sha256,
                 "matcher": self._matcher.name,
@@ -259,9 +286,11 @@ class Daemon:
         """See :meth:`Reporter.statistics`."""
         return self._reporter.statistics()
 
-    def run(self, stop: threading.Event) -> None:
+    def run(self, stop: threading.Event, on_ready: Callable[[], None] = lambda: None) -> None:
         """Work until ``stop`` is set or the frames end, then release everything; once only.
 
+        Args:
+            on_ready: called once, before the first frame.
         Raises: OrtholocError where a part failed for good; systemd then starts afresh.
         """
         with self._resources as resources:
@@ -278,6 +307,7 @@ class Daemon:
                 self._serve_bus(self._bus)
             resources.callback(systemd.notify, "STOPPING=1")
             systemd.notify("READY=1")
+            on_ready()
             logger.info(
                 "running: pack %s (%.0f MB in memory), matcher %s, solver %s",
                 self._config.map.pack, self._store.compressed_bytes / 1e6, self._matcher.name, pnp.SOLVER,
@@ -361,8 +391,11 @@ class Daemon:
                 logger.exception("reporting")
 
     def _feed_watchdog(self) -> None:
-        """Only while the capture thread comes back from its reads: a hung camera is no progress."""
-        if self._ended.is_set() or self._clock.now_ns() - self._capture_beat_ns <= _CAPTURE_HUNG_NS:
+        """Called by the worker, so while that comes round; and only while the capture thread comes back from its reads
+        and the link's from its line: a hung camera is no progress, nor are fixes that nobody is told."""
+        now_ns = self._clock.now_ns()
+        camera_lives = self._ended.is_set() or now_ns - self._capture_beat_ns <= _CAPTURE_HUNG_NS
+        if camera_lives and now_ns - self._link.beat_ns <= _LINK_HUNG_NS:
             systemd.notify("WATCHDOG=1")
 
     def _warm_up(self) -> None:
@@ -431,6 +464,11 @@ def configured_matcher(options: MatcherOptions) -> AnyMatcher:
         model_sha256=options.model_sha256,
         provider=options.provider,
     )
+
+
+def tuning_of(config: Config) -> Tuning:
+    """The options that a replay has to know of when they change."""
+    return Tuning(gate=config.localizer.gate, tracker=config.tracker, witness=config.witness)
 
 
 def make_navigator(

@@ -80,6 +80,8 @@ class Reporter:
         self._commander, self._replaced = commander, replaced
         self._unix_minus_stamp_ns = unix_minus_stamp_ns
         self._started_ns: int | None = None
+        # For systemd's status line.
+        self.remark = ""
         self._fixes_before = (0, 0)
         self._last_outcome: Outcome | None = None
         self._computer = ComputerReader()
@@ -157,7 +159,8 @@ class Reporter:
             self._log.note(now_ns, self.statistics())
         counts = self._counts
         status = "paused by command" if self._commander.paused else self._status(now_ns)
-        systemd.notify(f"STATUS={status}, {counts['fixes']} fixes, {counts['rejected']} rejected")
+        remark = f"; {self.remark}" if self.remark else ""
+        systemd.notify(f"STATUS={status}, {counts['fixes']} fixes, {counts['rejected']} rejected{remark}")
         if self._link.connected():
             self._report_damage()
             self._report_audit(now_ns)

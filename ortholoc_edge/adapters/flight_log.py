@@ -77,6 +77,7 @@ class LogOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     Attributes:
         folder: for flight logs; none are written if it is left out.
         max_mb: of all logs in the folder; the oldest go.
+        level: of the program's messages on stderr, which systemd's journal keeps: "debug", "info", "warning", "error".
         frames: "thumbnails", "all" (without loss, in grey, as they were localized: what a replay needs; 0.2 MB and 4 ms
             of another core's time each at 640x480) or "none".
     """
@@ -84,6 +85,7 @@ class LogOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     folder: Annotated[str, Meta(min_length=1)] | None = None
     max_mb: Annotated[int, Meta(ge=1)] = 256
     frames: Literal["thumbnails", "all", "none"] = "thumbnails"
+    level: Literal["debug", "info", "warning", "error"] = "info"
 
 
 class LogHeader(Struct, frozen=True, kw_only=True):
@@ -160,8 +162,7 @@ class FlightLog:
         """
         assert options.folder is not None
         self._folder, self._frames = Path(options.folder), options.frames
-        self._limit_bytes = options.max_mb * 2**20
-        self._file_bytes = min(self._limit_bytes // _FILES_OF_LIMIT, _MOST_FILE_BYTES)
+        self.limit(options.max_mb)
         self._georeference = georeference
         self._offset_ns = unix_minus_stamp_ns
         self._header = header
@@ -178,6 +179,11 @@ class FlightLog:
         self._queue: queue.Queue[_Entry | _Note | None] = queue.Queue(_QUEUE_LENGTH)
         self._thread = threading.Thread(target=self._run, name="flight-log", daemon=True)
         self._thread.start()
+
+    def limit(self, max_mb: int) -> None:
+        """Keep to another limit, from the next file on."""
+        self._limit_bytes = max_mb * 2**20
+        self._file_bytes = min(self._limit_bytes // _FILES_OF_LIMIT, _MOST_FILE_BYTES)
 
     def put(
         self,

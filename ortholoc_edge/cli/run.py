@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import signal
 import sys
 import threading
@@ -10,8 +11,9 @@ from pathlib import Path
 
 from ortholoc_edge.adapters.mavlink.link import SWITCH_INTERVAL_S
 from ortholoc_edge.cli.logs import from_a_thread_of_its_own
-from ortholoc_edge.config import read_config
+from ortholoc_edge.config import Config, read_config
 from ortholoc_edge.daemon import Daemon
+from ortholoc_edge.reload import RELOADABLE, Plan, Reloader
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -19,7 +21,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "run",
         help="the daemon: camera to autopilot",
         description="Localizes camera frames and sends vision position estimates to the autopilot until SIGTERM or "
-        "SIGINT, or the end of a folder or video. config/example.toml explains every key.",
+        "SIGINT, or the end of a folder or video. config/example.toml explains every key. SIGHUP reads the file again: "
+        f"{', '.join(RELOADABLE)} take effect at once, other keys are named and need a restart.",
     )
     parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="TOML")
     parser.set_defaults(run=run)
@@ -27,10 +30,22 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     sys.setswitchinterval(SWITCH_INTERVAL_S)
-    daemon = Daemon(read_config(args.config))
+
+    def set_level(config: Config) -> None:
+        logging.getLogger().setLevel(logging.DEBUG if args.verbose else config.log.level.upper())
+
+    def take_over(plan: Plan) -> None:
+        daemon.take_over(plan)
+        set_level(plan.config)
+
+    config = read_config(args.config)
+    set_level(config)
+    daemon = Daemon(config)
     stop = threading.Event()
+    reloader = Reloader(config, lambda: read_config(args.config), take_over)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
+    signal.signal(signal.SIGHUP, lambda *_: reloader.ask())
     with from_a_thread_of_its_own():
-        daemon.run(stop)
+        daemon.run(stop, on_ready=lambda: reloader.start(stop))
     return 0

@@ -28,6 +28,7 @@ from ortholoc_edge.daemon import Daemon
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.record import FrameRecord
 from ortholoc_edge.pipeline.tracker import GivenPosition, StartAnew
+from ortholoc_edge.reload import plan_reload
 
 # North of where it is, which the gate can't take for a wrong height.
 ASTRAY_M = 60.0
@@ -56,7 +57,7 @@ class Flown:
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
-    """Fixes; sent astray; called back; paused and resumed; a snapshot taken."""
+    """Fixes; sent astray; called back; paused and resumed; a stricter gate and back; a snapshot taken."""
     folder = tmp_path_factory.mktemp("commanded")
     photo = rendered.write_picture(folder / "photos" / "photo_000.jpg", rendered.picture(TRUTH))
     for number in range(1, 400):
@@ -108,6 +109,16 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
             command("pause", "pause again")
             command("resume")
             ended_with(is_fix, 2, "fixes after the pause")
+            # A gate that nothing passes, for a while.
+            flying = daemon._config
+            gate = msgspec.structs.replace(flying.localizer.gate, min_contrast=1e6, min_sure_contrast=1e6)
+            strict = msgspec.structs.replace(
+                flying, localizer=msgspec.structs.replace(flying.localizer, gate=gate)
+            )
+            daemon.take_over(plan_reload(flying, strict))
+            ended_with(lambda o: isinstance(o, Rejected), 2, "two rejections by the strict gate")
+            daemon.take_over(plan_reload(strict, flying))
+            ended_with(is_fix, 2, "fixes by the old gate")
             command("snapshot")
             states["last"] = latest("state")
             fix = wait_for(lambda: latest("fix"), "the latest fix")
@@ -168,13 +179,17 @@ def test_a_replay_takes_the_commands_in_too(flown: Flown, capsys: pytest.Capture
     assert (found["alone"], found["left_out"]) == (0, 0)
 
 
+@pytest.mark.parametrize("forgotten", [{"orders": ()}, {"tuning": None}])
 def test_a_replay_without_them_would_lie(
-    flown: Flown, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    flown: Flown,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    forgotten: dict[str, Any],
 ) -> None:
     """That is what the test before is worth."""
     whole = FrameRecord.circumstances
     monkeypatch.setattr(
-        FrameRecord, "circumstances", lambda record: whole(msgspec.structs.replace(record, orders=()))
+        FrameRecord, "circumstances", lambda record: whole(msgspec.structs.replace(record, **forgotten))
     )
     assert main(["replay", str(flown.folder), "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["differ"]

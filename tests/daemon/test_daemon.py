@@ -503,6 +503,31 @@ def test_watchdog_starves_when_the_camera_hangs(folder: Path, monkeypatch: pytes
         autopilot.close()
 
 
+def test_watchdog_starves_when_the_link_hangs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames go on, and nobody is told what they come to."""
+    said: list[str] = []
+    monkeypatch.setattr(systemd, "notify", said.append)
+    monkeypatch.setattr("ortholoc_edge.daemon._LINK_HUNG_NS", 300_000_000)
+    wire = UdpWire()
+    autopilot = HoveringAutopilot(wire)
+    daemon = Daemon(config(f"folder:{folder}", f"udpout:127.0.0.1:{wire.port}"))
+    released = threading.Event()
+    try:
+        with running(daemon):
+            wait_for(lambda: autopilot.messages("ODOMETRY"), "an estimate")
+            monkeypatch.setattr(daemon.link, "_receive", lambda *_: released.wait(20.0) and [])
+            wait_for(lambda: time.monotonic_ns() - daemon.link.beat_ns > 400_000_000, "a link that hangs")
+            fed = said.count("WATCHDOG=1")
+            frames_so_far = daemon.statistics()["fixes"]
+            wait_for(lambda: daemon.statistics()["fixes"] > frames_so_far + 1, "frames")
+            assert said.count("WATCHDOG=1") == fed
+            released.set()
+            wait_for(lambda: said.count("WATCHDOG=1") > fed, "the watchdog fed again")
+    finally:
+        released.set()
+        autopilot.close()
+
+
 def test_end_of_the_frames_ends_the_daemon(tmp_path: Path) -> None:
     for number in range(2):
         rendered.write_picture(tmp_path / f"{number}.jpg", rendered.picture(TRUTH))
