@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import faulthandler
 import logging
 import signal
 import sys
@@ -30,6 +31,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     sys.setswitchinterval(SWITCH_INTERVAL_S)
+    # systemd's watchdog ends a process that hangs by SIGABRT: where each thread was is then in the journal.
+    faulthandler.enable()
 
     def set_level(config: Config) -> None:
         logging.getLogger().setLevel(logging.DEBUG if args.verbose else config.log.level.upper())

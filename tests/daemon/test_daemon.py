@@ -515,11 +515,11 @@ def test_watchdog_starves_when_the_link_hangs(folder: Path, monkeypatch: pytest.
     try:
         with running(daemon):
             wait_for(lambda: autopilot.messages("ODOMETRY"), "an estimate")
-            monkeypatch.setattr(daemon.link, "_receive", lambda *_: released.wait(20.0) and [])
+            monkeypatch.setattr(daemon.link, "_receive", lambda *_: [released.wait(20.0)][:0])
             wait_for(lambda: time.monotonic_ns() - daemon.link.beat_ns > 400_000_000, "a link that hangs")
             fed = said.count("WATCHDOG=1")
-            frames_so_far = daemon.statistics()["fixes"]
-            wait_for(lambda: daemon.statistics()["fixes"] > frames_so_far + 1, "frames")
+            refused = daemon.statistics()["rejected"]
+            wait_for(lambda: daemon.statistics()["rejected"] > refused + 1, "frames without an attitude")
             assert said.count("WATCHDOG=1") == fed
             released.set()
             wait_for(lambda: said.count("WATCHDOG=1") > fed, "the watchdog fed again")

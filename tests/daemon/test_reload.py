@@ -69,10 +69,12 @@ def test_every_key_that_may_change_exists(key: str) -> None:
 class Running:
     """The daemon in a process, with what it tells systemd."""
 
-    def __init__(self, folder: Path, endpoint: str) -> None:
+    def __init__(
+        self, folder: Path, endpoint: str, program: tuple[str, ...] = ("-m", "ortholoc_edge"), more: str = ""
+    ) -> None:
         self.path = folder / "config.toml"
         self.text = toml(folder / "photos", endpoint).replace("rate_hz = 2.0", "rate_hz = 8.0")
-        self.text = self.text.replace('name = "sift"', 'name = "structural"')
+        self.text = self.text.replace('name = "sift"', 'name = "structural"') + more
         self.path.write_text(self.text, encoding="utf-8")
         self.told: list[str] = []
         self._log = (folder / "stderr").open("w+", encoding="utf-8")
@@ -80,7 +82,7 @@ class Running:
         self._supervisor.bind(str(folder / "notify"))
         self._supervisor.settimeout(20.0)
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "ortholoc_edge", "run", "--config", str(self.path)],
+            [sys.executable, *program, "run", "--config", str(self.path)],
             env={**os.environ, "NOTIFY_SOCKET": str(folder / "notify")}, stderr=self._log,
         )  # fmt: skip
 
