@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import math
 import re
 import tomllib
+import typing
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -219,7 +221,7 @@ def read_config(path: Path) -> Config:
     except tomllib.TOMLDecodeError as err:
         raise ConfigError(f"{path}: not TOML: {err}") from err
     except msgspec.ValidationError as err:
-        raise ConfigError(f"{path}: {err}; see config/example.toml for what is allowed") from err
+        raise ConfigError(f"{path}: {err}; {_allowed(str(err))}") from err
     _raise_first(path, _contradictions(config))
     return config
 
@@ -261,6 +263,25 @@ def _masked(value: Any) -> Any:
 def config_from_text(text: str) -> Config:
     """Raises: ValueError (of which msgspec's errors are)."""
     return msgspec.convert(json.loads(text), Config)
+
+
+_UNKNOWN = re.compile(r"unknown field `([^`]*)`(?: - at `\$\.?([\w.]*)`)?")
+
+
+def _allowed(message: str) -> str:
+    """What a key that does not exist may have been meant to be."""
+    found = _UNKNOWN.search(message)
+    if found is None:
+        return "see config/example.toml for what is allowed"
+    kind: Any = Config
+    for part in (found[2] or "").split("."):
+        if part:
+            kind = typing.get_type_hints(kind)[part]
+    names = [field.encode_name for field in msgspec.structs.fields(kind)]
+    near = difflib.get_close_matches(found[1], names, n=1)
+    meant = f"did you mean `{near[0]}`? " if near else ""
+    table = f"[{found[2]}]" if found[2] else "the file"
+    return f"{meant}{table} has: {', '.join(names)}"
 
 
 def _raise_first(path: Path, problems: Iterator[str]) -> None:

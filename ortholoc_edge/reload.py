@@ -57,7 +57,7 @@ def plan_reload(old: Config, new: Config) -> Plan:
     """
     before, after = _flat(msgspec.to_builtins(old)), _flat(msgspec.to_builtins(new))
     differing = [key for key in after if before.get(key) != after[key]]
-    changed = [key for key in differing if _may_change(key)]
+    changed = [key for key in differing if may_change(key)]
     mixed = msgspec.to_builtins(old)
     for key in changed:
         table = mixed
@@ -72,11 +72,12 @@ def plan_reload(old: Config, new: Config) -> Plan:
     return Plan(
         config,
         {key: (before[key], after[key]) for key in changed},
-        tuple(key for key in differing if not _may_change(key)),
+        tuple(key for key in differing if not may_change(key)),
     )
 
 
-def _may_change(key: str) -> bool:
+def may_change(key: str) -> bool:
+    """Whether a key, dotted, takes effect in flight."""
     return any(key == allowed or key.startswith(f"{allowed}.") for allowed in RELOADABLE)
 
 

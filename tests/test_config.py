@@ -51,7 +51,7 @@ def write(folder: Path, *changes: tuple[str, str]) -> Path:
         pytest.param("fx = 910.0", "fx = 1" + 400 * "0", r"intrinsics", id="too large for a float"),
         # Out of range or of the wrong kind.
         ("fy = 910.0", "fy = -910.0", r"\$\.intrinsics\.fy"),
-        ("width_px = 1280\nheight", "width_px = 0\nheight", r"\$\.intrinsics\.width_px"),
+        ("width_px = 1280       # of", "width_px = 0       # of", r"\$\.intrinsics\.width_px"),
         ('"nadir-nose-up" ', '"sideways" ', r"'sideways' is no mount.*nadir-nose-up, nadir.*, forward.*\$\.mount"),
         ('gimbal = "none"', 'gimbal = "some"', r"\$\.mount\.gimbal"),
         ('gimbal = "none"', 'gimbal = "auto"', r"'nadir-nose-up' with a gimbal.*forward.*\$\.mount"),
