@@ -148,7 +148,7 @@ class Daemon:
                 )
             )
             georeference = self._store.pack.georeference
-            _require_flyable(georeference, config.map.pack)
+            require_flyable(georeference, config.map.pack)
             self._matcher = matcher or configured_matcher(config.matcher)
             # In every life of the program another value, or the autopilot would not notice the restart.
             first_reset_counter = self._clock.now_ns() // _S
@@ -488,7 +488,8 @@ def make_navigator(
     )
 
 
-def _require_flyable(georeference: Georeference, pack: str) -> None:
+def require_flyable(georeference: Georeference, pack: str) -> None:
+    """Raises: MapError for a pack whose positions or heights mean nothing to an autopilot."""
     if georeference.crs is None:
         raise MapError(
             f"{pack}: has no reference system, so its positions mean nothing to an autopilot; rebuild it from rasters "
