@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import faulthandler
 import logging
+import queue
 import signal
 import sys
 import threading
@@ -46,9 +47,27 @@ def run(args: argparse.Namespace) -> int:
     daemon = Daemon(config)
     stop = threading.Event()
     reloader = Reloader(config, lambda: read_config(args.config), take_over)
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
-    signal.signal(signal.SIGHUP, lambda *_: reloader.ask())
+    _obey_signals(stop, reloader)
     with from_a_thread_of_its_own():
         daemon.run(stop, on_ready=lambda: reloader.start(stop))
     return 0
+
+
+def _obey_signals(stop: threading.Event, reloader: Reloader) -> None:
+    """SIGTERM and SIGINT set ``stop``, SIGHUP reads the configuration again.
+
+    By a thread: a handler runs in the main thread, which waits for ``stop`` itself, and would wait for ever for the
+    event's lock where it was interrupted holding it. Putting into a `SimpleQueue` takes none.
+    """
+    caught: queue.SimpleQueue[int] = queue.SimpleQueue()
+
+    def obey() -> None:
+        while True:
+            if caught.get() == signal.SIGHUP:
+                reloader.ask()
+            else:
+                stop.set()
+
+    threading.Thread(target=obey, name="signals", daemon=True).start()
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, lambda number, _: caught.put(number))

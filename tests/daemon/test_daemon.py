@@ -517,10 +517,16 @@ def test_watchdog_starves_when_the_link_hangs(folder: Path, monkeypatch: pytest.
             wait_for(lambda: autopilot.messages("ODOMETRY"), "an estimate")
             monkeypatch.setattr(daemon.link, "_receive", lambda *_: [released.wait(20.0)][:0])
             wait_for(lambda: time.monotonic_ns() - daemon.link.beat_ns > 400_000_000, "a link that hangs")
-            fed = said.count("WATCHDOG=1")
-            refused = daemon.statistics()["rejected"]
-            wait_for(lambda: daemon.statistics()["rejected"] > refused + 1, "frames without an attitude")
-            assert said.count("WATCHDOG=1") == fed
+
+            def more_frames() -> int:
+                """What the watchdog had been fed when the worker had come round again."""
+                refused = cast(int, daemon.statistics().get("rejected", 0))
+                wait_for(lambda: cast(int, daemon.statistics()["rejected"]) > refused + 1, "frames without an attitude")
+                return said.count("WATCHDOG=1")
+
+            # On a busy machine the worker may have looked before, and say so only now.
+            fed = more_frames()
+            assert more_frames() == fed
             released.set()
             wait_for(lambda: said.count("WATCHDOG=1") > fed, "the watchdog fed again")
     finally:
@@ -684,7 +690,7 @@ pack = "{rendered.store().pack.path}"
 [link]
 endpoint = "{endpoint}"
 [matcher]
-name = "sift"
+name = "structural"
 [timing]
 max_age_ms = 20000.0
 """

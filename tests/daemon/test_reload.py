@@ -73,8 +73,7 @@ class Running:
         self, folder: Path, endpoint: str, program: tuple[str, ...] = ("-m", "ortholoc_edge"), more: str = ""
     ) -> None:
         self.path = folder / "config.toml"
-        self.text = toml(folder / "photos", endpoint).replace("rate_hz = 2.0", "rate_hz = 8.0")
-        self.text = self.text.replace('name = "sift"', 'name = "structural"') + more
+        self.text = toml(folder / "photos", endpoint).replace("rate_hz = 2.0", "rate_hz = 8.0") + more
         self.path.write_text(self.text, encoding="utf-8")
         self.told: list[str] = []
         self._log = (folder / "stderr").open("w+", encoding="utf-8")
