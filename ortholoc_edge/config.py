@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import math
+import re
 import tomllib
+import typing
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -218,7 +221,7 @@ def read_config(path: Path) -> Config:
     except tomllib.TOMLDecodeError as err:
         raise ConfigError(f"{path}: not TOML: {err}") from err
     except msgspec.ValidationError as err:
-        raise ConfigError(f"{path}: {err}; see config/example.toml for what is allowed") from err
+        raise ConfigError(f"{path}: {err}; {_allowed(str(err))}") from err
     _raise_first(path, _contradictions(config))
     return config
 
@@ -228,9 +231,57 @@ def config_text(config: Config) -> str:
     return json.dumps(msgspec.to_builtins(config))
 
 
+def without_secrets(config: Config) -> dict[str, Any]:
+    """As plain values, for others to read: without names and passwords in addresses, and without where keys are."""
+    plain: dict[str, Any] = _masked(json.loads(config_text(config)))
+    return plain
+
+
+# In tables of any depth.
+_SECRET_KEYS = frozenset({"signing_key", "signing_state", "private_key"})
+_LEFT_OUT = "(left out)"
+# rtsp://NAME:PASSWORD@HOST, and properties of GStreamer's sources.
+_IN_ADDRESS = re.compile(r"(://)[^/@\s]+@")
+_AS_PROPERTY = re.compile(
+    r'\b(user-id|user-pw|proxy-id|proxy-pw|password|passwd|token|secret)(\s*=\s*)("[^"]*"|\S+)'
+)
+
+
+def _masked(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {
+            name: _LEFT_OUT if name in _SECRET_KEYS and part is not None else _masked(part)
+            for name, part in value.items()
+        }
+    if isinstance(value, list):
+        return [_masked(part) for part in value]
+    if isinstance(value, str):
+        return _AS_PROPERTY.sub(rf"\1\2{_LEFT_OUT}", _IN_ADDRESS.sub(rf"\1{_LEFT_OUT}@", value))
+    return value
+
+
 def config_from_text(text: str) -> Config:
     """Raises: ValueError (of which msgspec's errors are)."""
     return msgspec.convert(json.loads(text), Config)
+
+
+_UNKNOWN = re.compile(r"unknown field `([^`]*)`(?: - at `\$\.?([\w.]*)`)?")
+
+
+def _allowed(message: str) -> str:
+    """What a key that does not exist may have been meant to be."""
+    found = _UNKNOWN.search(message)
+    if found is None:
+        return "see config/example.toml for what is allowed"
+    kind: Any = Config
+    for part in (found[2] or "").split("."):
+        if part:
+            kind = typing.get_type_hints(kind)[part]
+    names = [field.encode_name for field in msgspec.structs.fields(kind)]
+    near = difflib.get_close_matches(found[1], names, n=1)
+    meant = f"did you mean `{near[0]}`? " if near else ""
+    table = f"[{found[2]}]" if found[2] else "the file"
+    return f"{meant}{table} has: {', '.join(names)}"
 
 
 def _raise_first(path: Path, problems: Iterator[str]) -> None:

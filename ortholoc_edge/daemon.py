@@ -8,7 +8,9 @@ Frames never queue: a position three frames old misleads by an amount that nobod
 
 from __future__ import annotations
 
+import json
 import logging
+import os
 import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -20,20 +22,24 @@ from typing import Generic, TypeVar
 from ortholoc_edge.adapters import systemd
 from ortholoc_edge.adapters.bus import Bus
 from ortholoc_edge.adapters.camera import BadFrameError, EndOfFrames, FrameSource, open_source
+from ortholoc_edge.adapters.commands import Answer, BusyError, Desk
 from ortholoc_edge.adapters.flight_log import FlightLog
 from ortholoc_edge.adapters.mavlink import AutopilotLink, Statistic, SystemStatus
+from ortholoc_edge.adapters.messages import NAME_OF_COMMAND, Command, CommandReply, ConfigMessage
 from ortholoc_edge.clock import Clock, SystemClock, wall_clock_ns
-from ortholoc_edge.config import Config, MatcherOptions, config_text
+from ortholoc_edge.commander import Commander
+from ortholoc_edge.config import Config, MatcherOptions, without_secrets
 from ortholoc_edge.errors import CameraError, LinkError, MapError, OrtholocError
 from ortholoc_edge.matching.registry import make_method
 from ortholoc_edge.matching.types import AnyMatcher
 from ortholoc_edge.pipeline import structural
 from ortholoc_edge.pipeline.frame import Frame, VehicleState
 from ortholoc_edge.pipeline.localizer import Localizer
-from ortholoc_edge.pipeline.navigator import Circumstances, Navigator
+from ortholoc_edge.pipeline.navigator import Circumstances, Navigator, Tuning
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.tracker import Tracker
 from ortholoc_edge.pose import pnp
+from ortholoc_edge.reload import Plan
 from ortholoc_edge.reporting import OutcomeListener, Reporter
 from ortholoc_edge.tiles.georeference import Georeference
 from ortholoc_edge.tiles.pack import Pack
@@ -48,8 +54,12 @@ _S = 1_000_000_000
 
 _WAIT_S = 0.2
 _MAX_ERRORS_IN_A_ROW = 5
+# A frame that is searched for takes a second at most (`[timing] max_age_ms`).
+_COMMAND_WAIT_S = 5.0
 # A read returns within `_WAIT_S`; a driver that holds it this long is not coming back by itself.
 _CAPTURE_HUNG_NS = 5_000_000_000
+# It comes round many times a second, and says when it waits longer.
+_LINK_HUNG_NS = 5_000_000_000
 
 
 class LatestSlot(Generic[T]):
@@ -123,6 +133,8 @@ class Daemon:
         self._config = config
         self._clock = clock or SystemClock()
         self._counts: Counter[str] = Counter()
+        self._slot: LatestSlot[Frame | _Missed] = LatestSlot()
+        self._desk = Desk()
         public_key = None if config.map.public_key is None else Path(config.map.public_key)
         with ExitStack() as resources:
             # Closed in reverse, also where a later part can't be had.
@@ -136,7 +148,7 @@ class Daemon:
                 )
             )
             georeference = self._store.pack.georeference
-            _require_flyable(georeference, config.map.pack)
+            require_flyable(georeference, config.map.pack)
             self._matcher = matcher or configured_matcher(config.matcher)
             # In every life of the program another value, or the autopilot would not notice the restart.
             first_reset_counter = self._clock.now_ns() // _S
@@ -150,8 +162,24 @@ class Daemon:
             self._vehicle = Vehicle(
                 self._link, tracker, georeference, config.mount, config.attitude, self._clock, self._counts
             )
-            bus = resources.enter_context(closing(Bus(config.bus))) if config.bus.enabled else None
-            log = resources.enter_context(closing(self._flight_log(config))) if config.log.folder else None
+            self._log = resources.enter_context(closing(self._flight_log(config))) if config.log.folder else None
+            self._commander = Commander(
+                self._navigator,
+                self._store,
+                self._link,
+                self._clock,
+                self._counts,
+                self.statistics,
+                lost_sigma_m=config.tracker.lost_sigma_m,
+                log=self._log,
+                snapshots=_snapshot_folder(config),
+            )
+            credentials = os.environ.get("CREDENTIALS_DIRECTORY")
+            self._bus = (
+                resources.enter_context(closing(Bus(config.bus, Path(credentials) if credentials else None)))
+                if config.bus.enabled
+                else None
+            )
             self._reporter = Reporter(
                 self._link,
                 config.link,
@@ -160,33 +188,86 @@ class Daemon:
                 self._navigator,
                 self._store,
                 self._counts,
-                bus=bus,
-                log=log,
+                self._commander,
+                replaced=lambda: self._slot.replaced,
+                unix_minus_stamp_ns=self._unix_minus_stamp_ns,
+                bus=self._bus,
+                log=self._log,
                 on_outcome=on_outcome,
             )
             self._frames = resources.enter_context(closing(frames or open_source(config.camera, self._clock)))
             self._resources = resources.pop_all()
-        self._slot: LatestSlot[Frame | _Missed] = LatestSlot()
         self._ended = threading.Event()
         self._capture_failure: BaseException | None = None
         self._capture_beat_ns = self._clock.now_ns()
 
-    def _flight_log(self, config: Config) -> FlightLog:
+    def _unix_minus_stamp_ns(self) -> int:
         # A clock that somebody sets, in simulation, is its own date.
-        real = isinstance(self._clock, SystemClock)
+        return wall_clock_ns() - self._clock.now_ns() if isinstance(self._clock, SystemClock) else 0
+
+    def _serve_bus(self, bus: Bus) -> None:
+        bus.serve(
+            {
+                "config": lambda: ConfigMessage(config=without_secrets(self._config)),
+                "stats": lambda: self._reporter.stats(self._clock.now_ns()),
+            },
+            self._on_command,
+        )
+
+    def _on_command(self, command: Command) -> Answer:
+        """In a thread of the bus."""
+        try:
+            return self._desk.ask(lambda: self._carry_out(command), _COMMAND_WAIT_S)
+        except BusyError as error:
+            return CommandReply(
+                command=NAME_OF_COMMAND[type(command)],
+                accepted=False,
+                reason=f"the frame path is busy: {error}",
+                remedy="ask again",
+            )
+
+    def _carry_out(self, command: Command) -> Answer:
+        answer = self._commander.carry_out(command)
+        self._reporter.publish_state(self._clock.now_ns())
+        return answer
+
+    def take_over(self, plan: Plan) -> None:
+        """Go on with another configuration from the next frame on; in any thread, which waits for it.
+
+        Raises: BusyError where the frame path does not come to it; then nothing has changed.
+        """
+        self._desk.ask(lambda: self._take_over(plan), _COMMAND_WAIT_S)
+
+    def _take_over(self, plan: Plan) -> None:
+        before, self._config = self._config, plan.config
+        tuning = tuning_of(plan.config)
+        if tuning != tuning_of(before):
+            self._navigator.retune(tuning)
+        self._navigator.ladder.allow(plan.config.timing.budget_ms)
+        self._vehicle.retune(plan.config.attitude)
+        self._commander.lost_sigma_m = plan.config.tracker.lost_sigma_m
+        if self._log is not None:
+            self._log.limit(plan.config.log.max_mb)
+        if self._bus is not None:
+            self._bus.retune(plan.config.bus)
+        self._counts["reloads"] += 1
+        self._reporter.remark = f"restart needed for {', '.join(plan.refused)}" if plan.refused else ""
+
+    def _flight_log(self, config: Config) -> FlightLog:
         now_ns = self._clock.now_ns()
         return FlightLog(
             config.log,
             self._store.pack.georeference,
             {
-                "config": config_text(config),
+                # A log is handed around.
+                "config": json.dumps(without_secrets(config)),
                 "pack": config.map.pack,
                 "pack_sha256": self._store.pack.manifest_sha256,
                 "matcher": self._matcher.name,
                 "model_sha256": self._matcher.model_sha256,
             },
             started_ns=now_ns,
-            unix_minus_stamp_ns=wall_clock_ns() - now_ns if real else 0,
+            unix_minus_stamp_ns=self._unix_minus_stamp_ns(),
         )
 
     @property
@@ -202,12 +283,14 @@ class Daemon:
         self._resources.close()
 
     def statistics(self) -> dict[str, Statistic]:
-        """See :meth:`Reporter.statistics`; and how many frames a newer one took the place of."""
-        return {**self._reporter.statistics(), "frames_replaced": self._slot.replaced}
+        """See :meth:`Reporter.statistics`."""
+        return self._reporter.statistics()
 
-    def run(self, stop: threading.Event) -> None:
+    def run(self, stop: threading.Event, on_ready: Callable[[], None] = lambda: None) -> None:
         """Work until ``stop`` is set or the frames end, then release everything; once only.
 
+        Args:
+            on_ready: called once, before the first frame.
         Raises: OrtholocError where a part failed for good; systemd then starts afresh.
         """
         with self._resources as resources:
@@ -220,8 +303,11 @@ class Daemon:
             resources.callback(self._join_capture, capture, stop)
             self._capture_beat_ns = self._clock.now_ns()
             capture.start()
+            if self._bus is not None:
+                self._serve_bus(self._bus)
             resources.callback(systemd.notify, "STOPPING=1")
             systemd.notify("READY=1")
+            on_ready()
             logger.info(
                 "running: pack %s (%.0f MB in memory), matcher %s, solver %s",
                 self._config.map.pack, self._store.compressed_bytes / 1e6, self._matcher.name, pnp.SOLVER,
@@ -273,6 +359,7 @@ class Daemon:
             # Before the slot is looked at: what came before the end must still be taken.
             ended = self._ended.is_set()
             item = self._slot.take(_WAIT_S)
+            self._desk.serve()
             self.report()
             if item is None:
                 if ended:
@@ -280,6 +367,9 @@ class Daemon:
                 continue
             if isinstance(item, _Missed):
                 self._reporter.publish(None, Rejected(item.stamp_ns, Reason.BAD_FRAME, item.why))
+                continue
+            if self._commander.paused:
+                self._reporter.publish(item, Rejected(item.stamp_ns, Reason.PAUSED, "by command; send resume"))
                 continue
             try:
                 self._handle(item, stop)
@@ -301,8 +391,11 @@ class Daemon:
                 logger.exception("reporting")
 
     def _feed_watchdog(self) -> None:
-        """Only while the capture thread comes back from its reads: a hung camera is no progress."""
-        if self._ended.is_set() or self._clock.now_ns() - self._capture_beat_ns <= _CAPTURE_HUNG_NS:
+        """Called by the worker, so while that comes round; and only while the capture thread comes back from its reads
+        and the link's from its line: a hung camera is no progress, nor are fixes that nobody is told."""
+        now_ns = self._clock.now_ns()
+        camera_lives = self._ended.is_set() or now_ns - self._capture_beat_ns <= _CAPTURE_HUNG_NS
+        if camera_lives and now_ns - self._link.beat_ns <= _LINK_HUNG_NS:
             systemd.notify("WATCHDOG=1")
 
     def _warm_up(self) -> None:
@@ -343,11 +436,21 @@ class Daemon:
                 outcome = replace(late, timings_ms=outcome.timings_ms)
             else:
                 self._vehicle.tell(outcome, localized.state)
-        self._reporter.publish(frame, outcome, (localized.outcome, localized.state, localized.circumstances))
+        step = localized.outcome, localized.state, localized.circumstances
+        self._reporter.publish(frame, outcome, step)
+        self._commander.note(frame, outcome, step)
         return outcome
 
     def _age_ms(self, stamp_ns: int) -> float:
         return (self._clock.now_ns() - stamp_ns) / 1e6
+
+
+def _snapshot_folder(config: Config) -> Path | None:
+    if config.log.folder is not None:
+        return Path(config.log.folder) / "snapshots"
+    # systemd separates several by colons.
+    state = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
+    return Path(state) / "snapshots" if state else None
 
 
 def configured_matcher(options: MatcherOptions) -> AnyMatcher:
@@ -361,6 +464,11 @@ def configured_matcher(options: MatcherOptions) -> AnyMatcher:
         model_sha256=options.model_sha256,
         provider=options.provider,
     )
+
+
+def tuning_of(config: Config) -> Tuning:
+    """The options that a replay has to know of when they change."""
+    return Tuning(gate=config.localizer.gate, tracker=config.tracker, witness=config.witness)
 
 
 def make_navigator(
@@ -380,7 +488,8 @@ def make_navigator(
     )
 
 
-def _require_flyable(georeference: Georeference, pack: str) -> None:
+def require_flyable(georeference: Georeference, pack: str) -> None:
+    """Raises: MapError for a pack whose positions or heights mean nothing to an autopilot."""
     if georeference.crs is None:
         raise MapError(
             f"{pack}: has no reference system, so its positions mean nothing to an autopilot; rebuild it from rasters "

@@ -7,14 +7,23 @@ from collections import Counter
 from collections.abc import Callable
 
 from ortholoc_edge.adapters import systemd
-from ortholoc_edge.adapters.bus import AutopilotRecord, Bus
-from ortholoc_edge.adapters.computer import ComputerReader
+from ortholoc_edge.adapters.bus import Bus
+from ortholoc_edge.adapters.computer import ComputerReader, ComputerStatus, resident_mib
 from ortholoc_edge.adapters.flight_log import FlightLog, LoggedStep
 from ortholoc_edge.adapters.mavlink import AutopilotLink, LinkOptions, Severity, Statistic, SystemStatus
 from ortholoc_edge.adapters.mavlink.audit import Level
 from ortholoc_edge.adapters.mavlink.checkup import Checkup
 from ortholoc_edge.adapters.mavlink.herald import Herald
 from ortholoc_edge.adapters.mavlink.sources import SourceSwitch, Withheld
+from ortholoc_edge.adapters.messages import (
+    AutopilotMessage,
+    HealthMessage,
+    StateMessage,
+    StatsMessage,
+    fix_message,
+    rejection_message,
+)
+from ortholoc_edge.commander import Commander
 from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.navigator import Navigator
 from ortholoc_edge.pipeline.outcome import Fix, Outcome
@@ -48,7 +57,10 @@ class Reporter:
         navigator: Navigator,
         store: MapStore,
         counts: Counter[str],
+        commander: Commander,
         *,
+        replaced: Callable[[], int],
+        unix_minus_stamp_ns: Callable[[], int],
         bus: Bus | None = None,
         log: FlightLog | None = None,
         on_outcome: OutcomeListener | None = None,
@@ -57,11 +69,21 @@ class Reporter:
         Args:
             options, lever_arm_m: as configured; the autopilot's settings are held against them.
             counts: the daemon's, to which ours are added.
+            commander: its `Commander.paused` is told.
+            replaced: how many frames a newer one took the place of.
+            unix_minus_stamp_ns: what makes dates of stamps, now.
             on_outcome: told of every outcome; must return at once.
         """
         self._link, self._vehicle, self._navigator, self._store = link, vehicle, navigator, store
         self._options, self._counts = options, counts
         self._bus, self._log, self._on_outcome = bus, log, on_outcome
+        self._commander, self._replaced = commander, replaced
+        self._unix_minus_stamp_ns = unix_minus_stamp_ns
+        self._started_ns: int | None = None
+        # For systemd's status line.
+        self.remark = ""
+        self._fixes_before = (0, 0)
+        self._last_outcome: Outcome | None = None
         self._computer = ComputerReader()
         self._checkup: Checkup | None = Checkup(link, options, lever_arm_m=lever_arm_m, ages=link.ages)
         self._findings_told: set[str] = set()
@@ -83,8 +105,10 @@ class Reporter:
             "gnss_consistency": witness.state.value,
             "gnss_apart_m": witness.apart_m,
             "map_files_damaged": len(self._store.damaged),
+            "frames_replaced": self._replaced(),
             "log_dropped": 0 if self._log is None else self._log.dropped,
             "bus_dropped": 0 if self._bus is None else self._bus.dropped,
+            "commands_refused": 0 if self._bus is None else self._bus.refused,
             **{f"link.{name}": value for name, value in self._link.statistics().items()},
         }
 
@@ -95,10 +119,25 @@ class Reporter:
         self._counts["fixes" if isinstance(outcome, Fix) else "rejected"] += 1
         if self._log is not None:
             self._log.put(frame, outcome, step)
+        self._last_outcome = outcome
         if self._bus is not None:
-            self._bus.publish(outcome)
+            self._publish_on(self._bus, frame, outcome, step)
         if self._on_outcome is not None:
             self._on_outcome(frame, outcome)
+
+    def _publish_on(self, bus: Bus, frame: Frame | None, outcome: Outcome, step: LoggedStep | None) -> None:
+        unix_ns = outcome.stamp_ns + self._unix_minus_stamp_ns()
+        if isinstance(outcome, Fix):
+            mount = None if step is None else self._navigator.tracker.mount(step[1])
+            bus.publish(fix_message(outcome, unix_ns, self._store.pack.georeference, mount))
+        else:
+            bus.publish(rejection_message(outcome, unix_ns))
+        if frame is not None:
+            bus.publish_image(frame.stamp_ns, frame.image)
+
+    def stats(self, now_ns: int) -> StatsMessage:
+        """For who asks; in any thread."""
+        return StatsMessage(stamp_ns=now_ns, unix_ns=now_ns + self._unix_minus_stamp_ns(), statistics=self.statistics())
 
     def step(self, now_ns: int) -> None:
         """To be called often; does its work once a second."""
@@ -111,11 +150,17 @@ class Reporter:
         # First what steers: a defect in what is only told must not keep it from being done.
         self._switch_sources(self._navigator.tracker.witness.report.state, now_ns)
         self._report_autopilot(now_ns)
-        self._link.report_computer(self._computer.read())
+        computer = self._computer.read()
+        self._link.report_computer(computer)
+        if self._bus is not None:
+            self.publish_state(now_ns)
+            self._bus.publish(self._health(now_ns, computer))
         if self._log is not None:
             self._log.note(now_ns, self.statistics())
         counts = self._counts
-        systemd.notify(f"STATUS={self._status(now_ns)}, {counts['fixes']} fixes, {counts['rejected']} rejected")
+        status = "paused by command" if self._commander.paused else self._status(now_ns)
+        remark = f"; {self.remark}" if self.remark else ""
+        systemd.notify(f"STATUS={status}, {counts['fixes']} fixes, {counts['rejected']} rejected{remark}")
         if self._link.connected():
             self._report_damage()
             self._report_audit(now_ns)
@@ -127,6 +172,54 @@ class Reporter:
             return TrackerStatus.TRACK
         status = self._navigator.tracker.status
         return TrackerStatus.COAST if status is TrackerStatus.TRACK else status
+
+    def publish_state(self, now_ns: int) -> None:
+        """What the daemon is about, for others: once a second, and when a command changed it."""
+        if self._bus is None:
+            return
+        last, tracker = self._last_outcome, self._navigator.tracker
+        self._bus.publish(
+            StateMessage(
+                stamp_ns=now_ns,
+                unix_ns=now_ns + self._unix_minus_stamp_ns(),
+                status=self._status(now_ns).value,
+                paused=self._commander.paused,
+                last_fix_age_s=None if self._last_fix_ns is None else (now_ns - self._last_fix_ns) / _S,
+                last_reason=None if last is None or isinstance(last, Fix) else last.reason.value,
+                rung=self._navigator.ladder.rung,
+                reset_counter=tracker.reset_counter,
+                gnss=tracker.witness.report.state.value,
+                autopilot=self._link.connected(),
+                commands=self._bus.accepts_commands,
+            )
+        )
+
+    def _health(self, now_ns: int, computer: ComputerStatus) -> HealthMessage:
+        if self._started_ns is None:
+            self._started_ns = now_ns
+        fixes, (before_ns, before) = self._counts["fixes"], self._fixes_before
+        self._fixes_before = now_ns, fixes
+        return HealthMessage(
+            stamp_ns=now_ns,
+            unix_ns=now_ns + self._unix_minus_stamp_ns(),
+            uptime_s=(now_ns - self._started_ns) / _S,
+            fixes=fixes,
+            rejected=self._counts["rejected"],
+            replaced=self._replaced(),
+            fixes_per_s=(fixes - before) * _S / (now_ns - before_ns) if before_ns else 0.0,
+            sent=self._link.fixes_sent,
+            cpu_percent=computer.cpu_percent,
+            rss_mib=resident_mib(),
+            memory_used_mib=computer.memory_used_mib,
+            memory_total_mib=computer.memory_total_mib,
+            temperatures_c=computer.temperatures_c,
+            under_voltage=computer.is_under_voltage,
+            throttled=computer.is_throttled,
+            hot=computer.is_hot,
+            map_files_damaged=len(self._store.damaged),
+            log_dropped=0 if self._log is None else self._log.dropped,
+            bus_dropped=0 if self._bus is None else self._bus.dropped,
+        )
 
     def _report_origin(self, now_ns: int) -> None:
         last_ns, told_ns = self._vehicle.no_origin_ns, self._origin_told_ns
@@ -143,7 +236,8 @@ class Reporter:
             logger.log(logging.INFO if severity >= Severity.NOTICE else logging.WARNING, "%s", text)
             self._link.send_status_text(severity, text)
         if self._bus is not None:
-            self._bus.publish_autopilot(autopilot_record(now_ns, self._link, witness, self._sources.on_vision))
+            unix_ns = now_ns + self._unix_minus_stamp_ns()
+            self._bus.publish(autopilot_message(now_ns, unix_ns, self._link, witness, self._sources.on_vision))
 
     def _switch_sources(self, consistency: Consistency, now_ns: int) -> None:
         """Command the autopilot's source set where that was enabled; announce what it took."""
@@ -211,7 +305,9 @@ class Reporter:
         self._link.send_status_text(Severity.WARNING, f"OrthoLoC: {len(damaged)} map files damaged")
 
 
-def autopilot_record(now_ns: int, link: AutopilotLink, witness: WitnessReport, on_vision: bool) -> AutopilotRecord:
+def autopilot_message(
+    now_ns: int, unix_ns: int, link: AutopilotLink, witness: WitnessReport, on_vision: bool
+) -> AutopilotMessage:
     """What is published of the autopilot."""
     fusion, advice = link.fusion, link.delay_advice
     median_ms, p99_ms = link.latency_ms
@@ -219,8 +315,9 @@ def autopilot_record(now_ns: int, link: AutopilotLink, witness: WitnessReport, o
     def age_s(since_ns: int) -> float | None:
         return (now_ns - since_ns) / _S if since_ns else None
 
-    return AutopilotRecord(
+    return AutopilotMessage(
         stamp_ns=now_ns,
+        unix_ns=unix_ns,
         connected=link.connected(),
         fusion=fusion.state.value,
         fusion_since_s=age_s(fusion.since_ns),

@@ -66,6 +66,10 @@ class Vehicle:
         self._restarts = 0
         self.no_origin_ns: int | None = None
 
+    def retune(self, attitude: AttitudeOptions) -> None:
+        """Take the autopilot's attitude for as good as that from now on."""
+        self._attitude = attitude
+
     # -- in ---------------------------------------------------------------------------------------------
 
     def at(self, stamp_ns: int, stop: threading.Event) -> VehicleState:

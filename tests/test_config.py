@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from ortholoc_edge.adapters.bus import Bus, BusOptions
+from ortholoc_edge.adapters.messages import rejection_message
 from ortholoc_edge.config import read_config, read_intrinsics
 from ortholoc_edge.errors import ConfigError, LinkError
 from ortholoc_edge.matching.registry import make_method
@@ -50,7 +51,7 @@ def write(folder: Path, *changes: tuple[str, str]) -> Path:
         pytest.param("fx = 910.0", "fx = 1" + 400 * "0", r"intrinsics", id="too large for a float"),
         # Out of range or of the wrong kind.
         ("fy = 910.0", "fy = -910.0", r"\$\.intrinsics\.fy"),
-        ("width_px = 1280\nheight", "width_px = 0\nheight", r"\$\.intrinsics\.width_px"),
+        ("width_px = 1280       # of", "width_px = 0       # of", r"\$\.intrinsics\.width_px"),
         ('"nadir-nose-up" ', '"sideways" ', r"'sideways' is no mount.*nadir-nose-up, nadir.*, forward.*\$\.mount"),
         ('gimbal = "none"', 'gimbal = "some"', r"\$\.mount\.gimbal"),
         ('gimbal = "none"', 'gimbal = "auto"', r"'nadir-nose-up' with a gimbal.*forward.*\$\.mount"),
@@ -170,8 +171,8 @@ def test_a_malformed_endpoint_is(endpoint: str) -> None:
 
 def test_outcomes_that_were_not_published_are_counted() -> None:
     bus = Bus(BusOptions(enabled=True, listen=("tcp/127.0.0.1:0",)))
-    bus.publish(Rejected(1, Reason.LATE))
+    bus.publish(rejection_message(Rejected(1, Reason.LATE), 1))
     assert bus.dropped == 0
     bus.close()
-    bus.publish(Rejected(2, Reason.LATE))
+    bus.publish(rejection_message(Rejected(2, Reason.LATE), 2))
     assert bus.dropped == 1

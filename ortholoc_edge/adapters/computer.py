@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,6 +79,15 @@ def parse_pi_throttled(text: str) -> tuple[bool, bool, bool]:
         return False, False, False
     hot = bool(word & _PI_SOFT_LIMIT)
     return bool(word & _PI_UNDER_VOLTAGE), bool(word & (_PI_FREQUENCY_CAPPED | _PI_THROTTLED)) or hot, hot
+
+
+def resident_mib(root: Path = Path("/")) -> float:
+    """Memory of this process that is in RAM; 0 where /proc does not tell."""
+    try:
+        pages = int((root / "proc/self/statm").read_text(encoding="ascii").split()[1])
+    except (OSError, ValueError, IndexError):
+        return 0.0
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 class ComputerReader:

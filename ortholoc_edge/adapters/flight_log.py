@@ -6,6 +6,7 @@
     /ortholoc/frame      ortholoc.Frame             what the step to the outcome depended on, and the outcome
     /ortholoc/outcome    ortholoc.Outcome           as published: a fix that came too late is a rejection here
     /ortholoc/health     ortholoc.Health            counters, once a second
+    /ortholoc/command    ortholoc.Command           what others asked for; what the tracker takes of it is in the frames
 
 A thread of its own writes: the frame path never waits for it. Each file is whole by itself and begins with a metadata
 record ``ortholoc`` (`LogHeader`). Chunks are small, each is handed to the system at once and the disk is told once a
@@ -35,6 +36,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from ortholoc_edge import __version__
+from ortholoc_edge.adapters.messages import Command, CommandReply
 from ortholoc_edge.errors import OrtholocError
 from ortholoc_edge.geometry import covariance as cov
 from ortholoc_edge.geometry import frames, rotation
@@ -75,6 +77,7 @@ class LogOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     Attributes:
         folder: for flight logs; none are written if it is left out.
         max_mb: of all logs in the folder; the oldest go.
+        level: of the program's messages on stderr, which systemd's journal keeps: "debug", "info", "warning", "error".
         frames: "thumbnails", "all" (without loss, in grey, as they were localized: what a replay needs; 0.2 MB and 4 ms
             of another core's time each at 640x480) or "none".
     """
@@ -82,6 +85,7 @@ class LogOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     folder: Annotated[str, Meta(min_length=1)] | None = None
     max_mb: Annotated[int, Meta(ge=1)] = 256
     frames: Literal["thumbnails", "all", "none"] = "thumbnails"
+    level: Literal["debug", "info", "warning", "error"] = "info"
 
 
 class LogHeader(Struct, frozen=True, kw_only=True):
@@ -123,6 +127,15 @@ class _Entry:
     step: LoggedStep | None
 
 
+@dataclass(frozen=True, slots=True)
+class _Note:
+    """A message that is ready, on its way to the disk."""
+
+    channel: str
+    stamp_ns: int
+    message: bytes
+
+
 class FlightLog:
     """Writes ``FOLDER/flight-NUMBER-DATE-PART.mcap``.
 
@@ -149,8 +162,7 @@ class FlightLog:
         """
         assert options.folder is not None
         self._folder, self._frames = Path(options.folder), options.frames
-        self._limit_bytes = options.max_mb * 2**20
-        self._file_bytes = min(self._limit_bytes // _FILES_OF_LIMIT, _MOST_FILE_BYTES)
+        self.limit(options.max_mb)
         self._georeference = georeference
         self._offset_ns = unix_minus_stamp_ns
         self._header = header
@@ -164,9 +176,14 @@ class FlightLog:
             self._file: _File | None = self._open()
         except OSError as err:
             raise OrtholocError(f"{self._folder}: can't write the log there ({err}); see log.folder") from err
-        self._queue: queue.Queue[_Entry | tuple[int, bytes] | None] = queue.Queue(_QUEUE_LENGTH)
+        self._queue: queue.Queue[_Entry | _Note | None] = queue.Queue(_QUEUE_LENGTH)
         self._thread = threading.Thread(target=self._run, name="flight-log", daemon=True)
         self._thread.start()
+
+    def limit(self, max_mb: int) -> None:
+        """Keep to another limit, from the next file on."""
+        self._limit_bytes = max_mb * 2**20
+        self._file_bytes = min(self._limit_bytes // _FILES_OF_LIMIT, _MOST_FILE_BYTES)
 
     def put(
         self,
@@ -186,9 +203,15 @@ class FlightLog:
 
     def note(self, stamp_ns: int, statistics: Mapping[str, Any]) -> None:
         """Hand over the counters; returns at once."""
-        self._hand_over((stamp_ns, msgspec.json.encode({"stamp_ns": stamp_ns, "statistics": statistics})))
+        content = {"stamp_ns": stamp_ns, "statistics": statistics}
+        self._hand_over(_Note("health", stamp_ns, msgspec.json.encode(content)))
 
-    def _hand_over(self, entry: _Entry | tuple[int, bytes]) -> None:
+    def command(self, stamp_ns: int, command: Command, reply: CommandReply) -> None:
+        """Hand over what somebody asked for; returns at once. For people: a replay has it from the frames."""
+        content = {"stamp_ns": stamp_ns, "request": command, "reply": reply}
+        self._hand_over(_Note("command", stamp_ns, msgspec.json.encode(content)))
+
+    def _hand_over(self, entry: _Entry | _Note) -> None:
         try:
             self._queue.put_nowait(entry)
         except queue.Full:
@@ -237,7 +260,7 @@ class FlightLog:
             except OSError as err:
                 logger.warning("%s: can't write the end of the log (%s); it can be read without", self._folder, err)
 
-    def _give_up(self, entry: _Entry | tuple[int, bytes], err: OSError) -> None:
+    def _give_up(self, entry: _Entry | _Note, err: OSError) -> None:
         """A file that broke off is left as it is: up to there it can be read."""
         self.dropped += isinstance(entry, _Entry)
         if self._file is not None:
@@ -248,7 +271,7 @@ class FlightLog:
             logger.warning("%s: can't write the log (%s); frames are dropped until it works", self._folder, err)
         self._failing = True
 
-    def _write(self, entry: _Entry | tuple[int, bytes]) -> None:
+    def _write(self, entry: _Entry | _Note) -> None:
         if self._file is None:
             if abs(_stamp_ns(entry) - self._failed_ns) < _AGAIN_AFTER_NS:
                 self.dropped += isinstance(entry, _Entry)
@@ -258,8 +281,7 @@ class FlightLog:
         if isinstance(entry, _Entry):
             self._write_frame(self._file, entry)
         else:
-            stamp_ns, counters = entry
-            self._file.add("health", stamp_ns + self._offset_ns, counters)
+            self._file.add(entry.channel, entry.stamp_ns + self._offset_ns, entry.message)
         self._file.flush(_stamp_ns(entry))
         if self._file.size() >= self._file_bytes:
             whole, self._file = self._file, None
@@ -416,8 +438,8 @@ def _as_strings(header: LogHeader) -> dict[str, str]:
     return {key: json.dumps(value) for key, value in msgspec.to_builtins(header).items()}
 
 
-def _stamp_ns(entry: _Entry | tuple[int, bytes]) -> int:
-    return entry.outcome.stamp_ns if isinstance(entry, _Entry) else entry[0]
+def _stamp_ns(entry: _Entry | _Note) -> int:
+    return entry.outcome.stamp_ns if isinstance(entry, _Entry) else entry.stamp_ns
 
 
 def _time(unix_ns: int) -> dict[str, int]:
@@ -497,4 +519,9 @@ _CHANNELS: dict[str, tuple[str, str, dict[str, Any]]] = {
         ),
     ),
     "health": ("/ortholoc/health", "ortholoc.Health", _object(stamp_ns=_INTEGER, statistics={"type": "object"})),
+    "command": (
+        "/ortholoc/command",
+        "ortholoc.Command",
+        _object(stamp_ns=_INTEGER, request={"type": "object"}, reply={"type": "object"}),
+    ),
 }

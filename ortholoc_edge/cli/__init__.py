@@ -17,8 +17,9 @@ EXIT_CONFIG = 78  # EX_CONFIG: systemd's RestartPreventExitStatus, a restart can
 
 # Each in the module of its name.
 _COMMANDS = (
-    "sim", "run", "doctor", "replay", "localize", "calibrate-focal", "tiles", "models", "samples", "bench",
-    "bench-replay", "bench-core", "bench-link", "bench-packs", "profile",
+    "sim", "run", "doctor", "bus", "check-config", "install-service", "replay", "localize", "calibrate-focal",
+    "tiles", "models", "samples", "bench", "bench-replay", "bench-core", "bench-link", "bench-bus", "bench-packs",
+    "profile",
 )  # fmt: skip
 
 
@@ -27,6 +28,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     # OpenBLAS threads fight the pipeline's own for two cores; nearest-neighbour search took four times the
     # CPU with them (matchers.md). It reads this once, when numpy is first imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # ONNX Runtime's wheels tell Microsoft of models and machines, from 1.29 on also those for Linux, unless told not to
+    # before they are loaded. A vehicle talks to nobody that its operator did not name.
+    os.environ["ORT_DISABLE_TELEMETRY"] = "1"
     given = sys.argv[1:] if argv is None else argv
     # What the others import, for building packs above all, would stay in the daemon's memory: 25 MB.
     command = next((word for word in given if not word.startswith("-")), None)

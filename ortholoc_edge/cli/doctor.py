@@ -1,4 +1,4 @@
-"""``doctor``: what is wrong with the link and the autopilot's settings, and what mends it."""
+"""``doctor``: what is wrong with the link, the autopilot's settings or this computer, and what mends it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ortholoc_edge.adapters.mavlink.parameters import Answer, Written
 from ortholoc_edge.adapters.mavlink.signing import beside
 from ortholoc_edge.cli.arguments import non_negative, positive
 from ortholoc_edge.clock import SystemClock
-from ortholoc_edge.config import read_config
+from ortholoc_edge.config import Config, read_config
 
 logger = logging.getLogger(__name__)
 
@@ -39,10 +39,12 @@ _WRITE_PATIENCE_S = 10.0
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = subparsers.add_parser(
         "doctor",
-        help="what is wrong with the autopilot's link and settings",
+        help="what is wrong with the autopilot's link and settings, or with this computer",
         description="Listens to the autopilot, reads the parameters that matter to vision, and prints what is wrong, "
         "why, and the command that mends it; docs/autopilot.md explains them. No parameter is changed without "
         "--fix; the autopilot is asked for streams of messages on this link (SET_MESSAGE_INTERVAL), as by the daemon. "
+        "With --computer it looks at this computer instead: clock, devices, keys, pack, model, memory, heat, disk and "
+        "the camera's pictures; the daemon must not run, since a camera is one program's. "
         "Exit status: 0 nothing wrong, 1 something is (notes don't count) or the link can't be opened, 2 usage, 78 the "
         "configuration or the endpoint can't be used.",
     )
@@ -56,6 +58,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
                         "mid-exposure until a fix is there, as the daemon measures it. The delay parameters are held "
                         "against what [link] release makes of it: about 0 with fast-forward (assumed without --config),"
                         " fixed_latency_ms with fixed-latency, this value with raw")  # fmt: skip
+    parser.add_argument("--computer", action="store_true", help="look at this computer instead of the autopilot; needs "
+                        "--config")  # fmt: skip
     parser.add_argument("--fix", action="store_true", help="set the parameters, after a question for each")
     parser.add_argument("--yes", action="store_true", help="with --fix: don't ask")
     parser.add_argument("--json", action="store_true", help="as JSON (default: text)")
@@ -75,7 +79,11 @@ def run(args: argparse.Namespace) -> int:
         args.usage_error("give --link ENDPOINT or --config FILE")
     if args.yes and not args.fix:
         args.usage_error("--yes is for --fix")
+    if args.computer and (args.config is None or args.link is not None or args.fix):
+        args.usage_error("--computer goes with --config FILE, and neither with --link nor with --fix")
     config = None if args.config is None else read_config(args.config)
+    if args.computer and config is not None:
+        return _computer(config, as_json=args.json)
     options = LinkOptions(endpoint=args.link) if config is None else config.link
     changes: dict[str, Any] = {"component_id": _COMPONENT}
     if args.link is not None:
@@ -115,6 +123,18 @@ def run(args: argparse.Namespace) -> int:
             print(json.dumps(_facts(options, situation, findings, written), indent=2))
     finally:
         link.stop()
+    return 1 if any(finding.level is not Level.NOTE for finding in findings) else 0
+
+
+def _computer(config: Config, *, as_json: bool) -> int:
+    # Not at the top: it opens maps and cameras, which the rest does not need.
+    from ortholoc_edge.preflight import check_computer
+
+    findings = check_computer(config, SystemClock(), os.environ)
+    if as_json:
+        print(json.dumps({"findings": [asdict(finding) for finding in findings]}, indent=2))
+    else:
+        _print_findings(findings)
     return 1 if any(finding.level is not Level.NOTE for finding in findings) else 0
 
 

@@ -33,6 +33,11 @@ class Ladder:
     def rung(self) -> int:
         return self._rung
 
+    def allow(self, budget_ms: float) -> None:
+        """Another budget from now on. One that has none, since a replay must be the same everywhere, gets none."""
+        if self._budget_ms is not None:
+            self._budget_ms = budget_ms
+
     def note(self, took_ms: float) -> None:
         """A frame on the present rung took so long."""
         if self._budget_ms is None:

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 import cv2
 import numpy as np
-from msgspec import Meta, Struct, field
+from msgspec import Meta, Struct, field, structs
 
 from ortholoc_edge.errors import ConfigError, MapError
 from ortholoc_edge.geometry import homography
@@ -179,6 +179,10 @@ class Localizer:
 
     def close(self) -> None:
         self._worker.shutdown()
+
+    def retune(self, limits: gate.GateOptions) -> None:
+        """Judge the next frames by other limits."""
+        self._options = structs.replace(self._options, gate=limits)
 
     def warm_up(self) -> None:
         """Extract from a picture and match it with itself: what is allocated and compiled at first use is ready then.

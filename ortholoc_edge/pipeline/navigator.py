@@ -9,11 +9,13 @@ from typing import Annotated
 from msgspec import Meta, Struct
 
 from ortholoc_edge.pipeline.frame import Frame, VehicleState
+from ortholoc_edge.pipeline.gate import GateOptions
 from ortholoc_edge.pipeline.ladder import Ladder
 from ortholoc_edge.pipeline.localizer import Localizer
 from ortholoc_edge.pipeline.outcome import Outcome, Rejected
 from ortholoc_edge.pipeline.prior import PosePrior
-from ortholoc_edge.pipeline.tracker import Tracker
+from ortholoc_edge.pipeline.tracker import Order, Tracker, TrackerOptions
+from ortholoc_edge.pipeline.witness import WitnessOptions
 
 
 class TimingOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -29,6 +31,14 @@ class TimingOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     budget_ms: Annotated[float, Meta(gt=0)] = 200.0
 
 
+class Tuning(Struct, frozen=True, kw_only=True):
+    """Options that may change in flight and that an outcome depends on."""
+
+    gate: GateOptions
+    tracker: TrackerOptions
+    witness: WitnessOptions
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Circumstances:
     """What a step depended on besides its frame, its state and the steps before: with these it can be taken again.
@@ -39,6 +49,8 @@ class Circumstances:
         rung: of detail.
         proceeded: how often it was told to go on before it was told to stop, or did not ask any more.
         reset_counter: the tracker's before the step; others may raise it between steps.
+        orders: what the tracker was told since the step before.
+        tuning: options that are no longer those of the start; None while they are.
     """
 
     number: int
@@ -46,6 +58,8 @@ class Circumstances:
     rung: int
     proceeded: int
     reset_counter: int
+    orders: tuple[Order, ...] = ()
+    tuning: Tuning | None = None
 
 
 class Navigator:
@@ -68,11 +82,23 @@ class Navigator:
         self.ladder = Ladder(localizer.rungs, budget_ms)
         self.last: Circumstances | None = None
         self._steps = 0
+        self._orders: list[Order] = []
+        self._tuning: Tuning | None = None
 
     @property
     def prior(self) -> PosePrior | None:
         """The prediction for the last frame; None if there was none."""
         return None if self.last is None else self.last.prior
+
+    def give(self, order: Order) -> None:
+        """Tell the tracker, with the next step."""
+        self._orders.append(order)
+
+    def retune(self, tuning: Tuning) -> None:
+        """Go on with other options."""
+        self._tuning = tuning
+        self.localizer.retune(tuning.gate)
+        self.tracker.retune(tuning.tracker, tuning.witness)
 
     def step(self, frame: Frame, state: VehicleState, proceed: Callable[[], bool] = lambda: True) -> Outcome:
         """What the frame comes to, given the vehicle's state at its exposure. ``proceed``: see `Localizer.localize`."""
@@ -86,11 +112,17 @@ class Navigator:
     def step_again(self, frame: Frame, state: VehicleState, was: Circumstances) -> Outcome:
         """A recorded step, after those before it: the same outcome, however fast this computer is."""
         self.tracker.reset_counter = was.reset_counter
+        if was.tuning is not None and was.tuning != self._tuning:
+            self.retune(was.tuning)
+        self._orders = list(was.orders)
         return self._step(frame, state, _yes(was.proceeded), was.rung)
 
     def _step(self, frame: Frame, state: VehicleState, proceed: Callable[[], bool], rung: int) -> Outcome:
         number, reset_counter, proceeded = self._steps, self.tracker.reset_counter, 0
         self._steps += 1
+        orders, self._orders = tuple(self._orders), []
+        for order in orders:
+            self.tracker.take(order)
 
         def counted() -> bool:
             nonlocal proceeded
@@ -104,7 +136,7 @@ class Navigator:
             prior, outcome = None, predicted
         else:
             prior, outcome = predicted, self.localizer.localize(frame, predicted, counted, rung)
-        self.last = Circumstances(number, prior, rung, proceeded, reset_counter)
+        self.last = Circumstances(number, prior, rung, proceeded, reset_counter, orders, self._tuning)
         self.tracker.update(outcome, state)
         return outcome
 
@@ -113,6 +145,8 @@ def localize_again(localizer: Localizer, frame: Frame, was: Circumstances) -> Ou
     """A recorded step without those before it, from the prediction that it had; None if it had none."""
     if was.prior is None:
         return None
+    if was.tuning is not None:
+        localizer.retune(was.tuning.gate)
     return localizer.localize(frame, was.prior, _yes(was.proceeded), was.rung)
 
 

@@ -33,6 +33,7 @@ class Reason(StrEnum):
     PRIOR_DISAGREES = "prior_disagrees"  # heading or position too far from what was predicted
     UNCERTAIN = "uncertain"  # the pose's own covariance is too wide
     LATE = "late"
+    PAUSED = "paused"  # by command
     INTERNAL = "internal"
 
 

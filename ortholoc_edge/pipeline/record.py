@@ -11,9 +11,10 @@ from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.frame import CameraMount, VehicleState
-from ortholoc_edge.pipeline.navigator import Circumstances
+from ortholoc_edge.pipeline.navigator import Circumstances, Tuning
 from ortholoc_edge.pipeline.outcome import Fix, Outcome
 from ortholoc_edge.pipeline.prior import PosePrior
+from ortholoc_edge.pipeline.tracker import Order
 
 
 def outcome_record(outcome: Outcome) -> dict[str, Any]:
@@ -59,6 +60,7 @@ class FrameRecord(Struct, frozen=True, kw_only=True):
         whole: whether the picture beside it is without loss.
         mount: the gimbal's ``body_from_camera`` as (3, 4) and its sigmas; None of a fixed one.
         outcome: `outcome_record`, before its age was looked at.
+        orders, tuning: `Circumstances.orders` and ``tuning``; logs of older versions have none.
     """
 
     number: int
@@ -80,6 +82,8 @@ class FrameRecord(Struct, frozen=True, kw_only=True):
     proceeded: int
     reset_counter: int
     outcome: dict[str, Any]
+    orders: tuple[Order, ...] = ()
+    tuning: Tuning | None = None
 
     def state(self) -> VehicleState:
         return VehicleState(
@@ -99,7 +103,9 @@ class FrameRecord(Struct, frozen=True, kw_only=True):
         prior = None
         if self.prior_map_from_camera is not None and self.prior_covariance is not None:
             prior = PosePrior(_rigid(self.prior_map_from_camera), _floats(self.prior_covariance))
-        return Circumstances(self.number, prior, self.rung, self.proceeded, self.reset_counter)
+        return Circumstances(
+            self.number, prior, self.rung, self.proceeded, self.reset_counter, self.orders, self.tuning
+        )
 
 
 def frame_record(
@@ -127,6 +133,8 @@ def frame_record(
         proceeded=circumstances.proceeded,
         reset_counter=circumstances.reset_counter,
         outcome=outcome_record(outcome),
+        orders=circumstances.orders,
+        tuning=circumstances.tuning,
     )
 
 

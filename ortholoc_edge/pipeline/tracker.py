@@ -53,6 +53,36 @@ class TrackerOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     jump_m: Annotated[float, Meta(gt=0)] = 5.0
 
 
+class GivenPosition(Struct, frozen=True, kw_only=True, tag="set_prior"):
+    """Somebody knows where the vehicle is: search there, whatever the chain of fixes says.
+
+    Attributes:
+        stamp_ns: when it was said.
+        position_map_m: of the body: easting, northing, height.
+        sigma_m: horizontal (per axis) and vertical.
+    """
+
+    stamp_ns: int
+    position_map_m: tuple[float, float, float]
+    sigma_m: tuple[float, float]
+
+
+class StartAnew(Struct, frozen=True, kw_only=True, tag="relocalize"):
+    """The chain of fixes is wrong: forget it.
+
+    Attributes:
+        stamp_ns: when it was said.
+        trust_gnss: forget also that GNSS contradicted it.
+    """
+
+    stamp_ns: int
+    trust_gnss: bool
+
+
+# What somebody outside tells the tracker between two frames.
+Order = GivenPosition | StartAnew
+
+
 class TrackerStatus(StrEnum):
     """SEARCH: no idea where. TRACK: the last frame gave a fix. COAST: carried on from an older fix."""
 
@@ -63,7 +93,10 @@ class TrackerStatus(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Anchor:
-    """Where the body was at the last fix (or the last trusted GNSS position), and what the odometry said then.
+    """Where the body was at the last fix (or where somebody said, or at the last trusted GNSS position), and what the
+    odometry said then.
+
+    ``firm``: GNSS that contradicts it does not take its place.
 
     ``settled`` is the covariance without the fix's `Fix.ground_covariance`: GNSS is judged by that. Over a wood it
     would else pass for the surer of the two, and take the place of the chain of fixes that contradicts it.
@@ -75,7 +108,7 @@ class _Anchor:
     settled: FloatArray
     odometry_ned_m: FloatArray | None
     odometry_epoch: int
-    from_fix: bool
+    firm: bool
 
 
 class Tracker:
@@ -105,10 +138,25 @@ class Tracker:
         self._fixed_mount = None if body_from_camera is None else CameraMount(body_from_camera)
         self._options = options
         self._anchor: _Anchor | None = None
+        self._given: GivenPosition | None = None
         self._last_prior: PosePrior | None = None
         self._gnss_turn = False
         self.status = TrackerStatus.SEARCH
         self.reset_counter = first_reset_counter % 256
+
+    def take(self, order: Order) -> None:
+        """Act on it with the next `predict`; the fix after it is a new start for the autopilot."""
+        self.status = TrackerStatus.SEARCH
+        self._anchor = self._given = None
+        if isinstance(order, GivenPosition):
+            self._given = order
+        elif order.trust_gnss:
+            self.witness.start_anew(order.stamp_ns)
+
+    def retune(self, options: TrackerOptions, witness: WitnessOptions) -> None:
+        """Go on with other options."""
+        self._options = options
+        self.witness.retune(witness)
 
     def predict(self, state: VehicleState) -> PosePrior | Rejected:
         """The pose to expect at the state's stamp, or why there is none."""
@@ -120,6 +168,7 @@ class Tracker:
                 state.stamp_ns, Reason.BAD_ATTITUDE, f"no finite attitude from the autopilot at the exposure{why}"
             )
         self.witness.tick(state.stamp_ns)
+        self._take_given(state)
         self._take_absolute(state)
         mount = self.mount(state)
         if mount is None:
@@ -177,7 +226,7 @@ class Tracker:
         ground = outcome.ground_covariance
         covariance = cov.of_moved_point(outcome.covariance, lever)
         settled = covariance if ground is None else cov.of_moved_point(outcome.covariance - ground, lever)
-        self._anchor = _anchor(state, body.translation, covariance[:3, :3], settled[:3, :3], from_fix=True)
+        self._anchor = _anchor(state, body.translation, covariance[:3, :3], settled[:3, :3], firm=True)
         if state.position_map_m is not None:
             both = settled[:2, :2] + np.eye(2) * state.position_sigma_m[0] ** 2
             self.witness.compare(state.stamp_ns, state.position_map_m - body.translation, both)
@@ -240,7 +289,7 @@ class Tracker:
         while GNSS is spoofed. They take turns; the first fix decides.
         """
         believed = self._believed(state)
-        if believed is None or self._anchor is None or self._anchor.from_fix:
+        if believed is None or self._anchor is None or self._anchor.firm:
             return False
         apart = cov.mahalanobis_squared((believed[0] - carried[0])[:2], (believed[1] + carried[1])[:2, :2])
         if apart <= _CONTRADICTION_SIGMAS**2:
@@ -251,6 +300,16 @@ class Tracker:
     def announce_jump(self) -> None:
         """The next estimate starts anew for the autopilot: its origin moved, or it restarted."""
         self.reset_counter = (self.reset_counter + 1) % 256
+
+    def _take_given(self, state: VehicleState) -> None:
+        """Anchor at the position that was given. Since then the vehicle flew on, nobody knows where to."""
+        given, self._given = self._given, None
+        if given is None:
+            return
+        elapsed_s = max(state.stamp_ns - given.stamp_ns, 0) * 1e-9
+        flown = _axes(self._options.unaided_speed_m_per_s * elapsed_s, self._options.unaided_climb_m_per_s * elapsed_s)
+        covariance = _axes(*given.sigma_m) + flown
+        self._anchor = _anchor(state, np.array(given.position_map_m), covariance, covariance, firm=True)
 
     def _take_absolute(self, state: VehicleState) -> None:
         """Anchor at a trusted position of the autopilot's own (GNSS), if it is worth more than what we have.
@@ -273,18 +332,18 @@ class Tracker:
             if _sigma(settled) <= _sigma(covariance):
                 return
             apart = cov.mahalanobis_squared(position - carried[0], covariance + settled)
-            if self._anchor.from_fix and apart > _CONTRADICTION_SIGMAS**2:
+            if self._anchor.firm and apart > _CONTRADICTION_SIGMAS**2:
                 return
-        self._anchor = _anchor(state, position, covariance, covariance, from_fix=False)
+        self._anchor = _anchor(state, position, covariance, covariance, firm=False)
 
 
 def _anchor(
-    state: VehicleState, position: FloatArray, covariance: FloatArray, settled: FloatArray, from_fix: bool
+    state: VehicleState, position: FloatArray, covariance: FloatArray, settled: FloatArray, firm: bool
 ) -> _Anchor:
     odometry = state.odometry_ned_m
     usable = odometry is not None and bool(np.isfinite(odometry).all())
     return _Anchor(
-        state.stamp_ns, position, covariance, settled, odometry if usable else None, state.odometry_epoch, from_fix
+        state.stamp_ns, position, covariance, settled, odometry if usable else None, state.odometry_epoch, firm
     )
 
 

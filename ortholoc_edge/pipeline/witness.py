@@ -144,12 +144,23 @@ class Witness:
     def tick(self, now_ns: int) -> None:
         """Time goes on without a difference: what was known is forgotten after a while."""
         if self._last_ns is not None and now_ns - self._last_ns > self._options.forget_s * _S:
-            self._last_ns = None
-            self._score = self._compared_s = self._clear_s = 0.0
-            self._apart_m = None
-            self._heights_m.clear()
-            self._last_squared.clear()
-            self._enter(Consistency.UNKNOWN, now_ns)
+            self._forget(now_ns)
+
+    def _forget(self, now_ns: int) -> None:
+        self._last_ns = None
+        self._score = self._compared_s = self._clear_s = 0.0
+        self._apart_m = None
+        self._heights_m.clear()
+        self._last_squared.clear()
+        self._enter(Consistency.UNKNOWN, now_ns)
+
+    def start_anew(self, now_ns: int) -> None:
+        """Forget what was concluded: somebody knows that the fixes were wrong, and not GNSS."""
+        self._forget(now_ns)
+
+    def retune(self, options: WitnessOptions) -> None:
+        """Judge by other limits from now on; what was summed up stays."""
+        self._options = options
 
     def _judge(self, now_ns: int) -> None:
         options = self._options

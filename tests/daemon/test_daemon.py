@@ -30,10 +30,10 @@ from mcap.reader import make_reader
 from replay import rendered
 
 from ortholoc_edge.adapters import systemd
-from ortholoc_edge.adapters.bus import AutopilotRecord
 from ortholoc_edge.adapters.camera import CameraOptions, EndOfFrames, FrameSource, open_source
 from ortholoc_edge.adapters.flight_log import LogOptions
 from ortholoc_edge.adapters.mavlink import SystemStatus
+from ortholoc_edge.adapters.messages import AutopilotMessage
 from ortholoc_edge.clock import SystemClock
 from ortholoc_edge.config import Config, MountOptions
 from ortholoc_edge.daemon import Daemon, LatestSlot
@@ -359,16 +359,18 @@ def test_spoofed_gnss_is_told_and_the_source_switched_where_enabled(folder: Path
 class _Bus:
     """Keeps what is published of the autopilot."""
 
-    dropped = 0
+    dropped = refused = 0
+    accepts_commands = False
 
     def __init__(self) -> None:
-        self.records: list[AutopilotRecord] = []
+        self.records: list[AutopilotMessage] = []
 
-    def publish(self, outcome: Outcome) -> None:
+    def publish(self, message: Any) -> None:
+        if isinstance(message, AutopilotMessage):
+            self.records.append(message)
+
+    def publish_image(self, stamp_ns: int, image: Any) -> None:
         pass
-
-    def publish_autopilot(self, record: AutopilotRecord) -> None:
-        self.records.append(record)
 
 
 def test_a_lost_link_is_published(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -498,6 +500,37 @@ def test_watchdog_starves_when_the_camera_hangs(folder: Path, monkeypatch: pytes
             time.sleep(0.7)
             assert said.count("WATCHDOG=1") == fed
     finally:
+        autopilot.close()
+
+
+def test_watchdog_starves_when_the_link_hangs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames go on, and nobody is told what they come to."""
+    said: list[str] = []
+    monkeypatch.setattr(systemd, "notify", said.append)
+    monkeypatch.setattr("ortholoc_edge.daemon._LINK_HUNG_NS", 300_000_000)
+    wire = UdpWire()
+    autopilot = HoveringAutopilot(wire)
+    daemon = Daemon(config(f"folder:{folder}", f"udpout:127.0.0.1:{wire.port}"))
+    released = threading.Event()
+    try:
+        with running(daemon):
+            wait_for(lambda: autopilot.messages("ODOMETRY"), "an estimate")
+            monkeypatch.setattr(daemon.link, "_receive", lambda *_: [released.wait(20.0)][:0])
+            wait_for(lambda: time.monotonic_ns() - daemon.link.beat_ns > 400_000_000, "a link that hangs")
+
+            def more_frames() -> int:
+                """What the watchdog had been fed when the worker had come round again."""
+                refused = cast(int, daemon.statistics().get("rejected", 0))
+                wait_for(lambda: cast(int, daemon.statistics()["rejected"]) > refused + 1, "frames without an attitude")
+                return said.count("WATCHDOG=1")
+
+            # On a busy machine the worker may have looked before, and say so only now.
+            fed = more_frames()
+            assert more_frames() == fed
+            released.set()
+            wait_for(lambda: said.count("WATCHDOG=1") > fed, "the watchdog fed again")
+    finally:
+        released.set()
         autopilot.close()
 
 
@@ -657,7 +690,7 @@ pack = "{rendered.store().pack.path}"
 [link]
 endpoint = "{endpoint}"
 [matcher]
-name = "sift"
+name = "structural"
 [timing]
 max_age_ms = 20000.0
 """

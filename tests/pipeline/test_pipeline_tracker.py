@@ -14,7 +14,7 @@ from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.frame import VehicleState
 from ortholoc_edge.pipeline.outcome import Reason, Rejected
 from ortholoc_edge.pipeline.prior import PosePrior
-from ortholoc_edge.pipeline.tracker import Tracker, TrackerOptions, TrackerStatus
+from ortholoc_edge.pipeline.tracker import GivenPosition, StartAnew, Tracker, TrackerOptions, TrackerStatus
 from ortholoc_edge.pipeline.witness import Consistency
 from ortholoc_edge.tiles.georeference import Georeference, VerticalDatum
 
@@ -441,3 +441,67 @@ def test_another_life_begins_with_another_reset_counter():
     assert made.reset_counter == 1000 % 256
     made.announce_jump()
     assert made.reset_counter == 1000 % 256 + 1
+
+
+# -- what it is told from outside ---------------------------------------------
+
+
+def given_at(*position, seconds=0.0, sigma=(10.0, 4.0)):
+    return GivenPosition(stamp_ns=round(seconds * SECOND), position_map_m=position, sigma_m=sigma)
+
+
+def test_a_given_position_takes_the_place_of_the_chain_of_fixes():
+    made = fixed()
+    made.take(given_at(500.0, 0.0, 100.0, seconds=1.0))
+    prior = made.predict(state(1.0, (0, 0, 0)))
+    assert np.allclose(prior.map_from_camera.translation, (500, 0, 100))
+    assert np.allclose(sigma_of(prior), (10, 10, 4))
+    # From there the odometry carries it on as it does a fix: 20 m north.
+    later = made.predict(state(2.0, (20, 0, 0)))
+    assert np.allclose(later.map_from_camera.translation, (500, 20, 100))
+    before = made.reset_counter
+    made.update(fix((500.0, 20.0, 100.0)), state(2.0, (20, 0, 0)))
+    assert made.reset_counter == (before + 1) % 256, "a new start for the autopilot"
+
+
+def test_the_longer_ago_it_was_given_the_less_it_is_worth():
+    """A frame without attitude is no use for it; meanwhile the vehicle flew on, nobody knows where to."""
+    made = tracker(unaided_speed_m_per_s=15.0, unaided_climb_m_per_s=4.0)
+    made.take(given_at(1.0, 2.0, 100.0))
+    assert isinstance(made.predict(state(1.0, attitude=None)), Rejected)
+    prior = made.predict(state(2.0))
+    assert np.allclose(sigma_of(prior), (np.hypot(10, 30), np.hypot(10, 30), np.hypot(4, 8)))
+
+
+@pytest.mark.parametrize(("gnss_east_m", "wins"), [(510.0, True), (700.0, False)])
+def test_gnss_that_is_surer_improves_a_given_position_only_where_it_agrees(gnss_east_m, wins):
+    made = fixed()
+    made.take(given_at(500.0, 0.0, 100.0))
+    prior = made.predict(state(0.0, (0, 0, 0), position=(gnss_east_m, 0, 100)))
+    assert prior.map_from_camera.translation[0] == pytest.approx(gnss_east_m if wins else 500.0)
+
+
+def test_relocalizing_forgets_the_fixes_and_asks_gnss():
+    made = fixed()
+    far = state(0.0, (0, 0, 0), position=(300, 0, 100))
+    assert np.allclose(made.predict(far).map_from_camera.translation, (0, 0, 100)), "the chain of fixes holds"
+    made.take(StartAnew(stamp_ns=0, trust_gnss=False))
+    assert made.status is TrackerStatus.SEARCH
+    assert np.allclose(made.predict(far).map_from_camera.translation, (300, 0, 100))
+    made.take(given_at(1.0, 2.0, 100.0))
+    made.take(StartAnew(stamp_ns=0, trust_gnss=False))
+    assert isinstance(made.predict(state(1.0)), Rejected), "what was given before is forgotten, too"
+
+
+def test_relocalizing_does_not_trust_a_gnss_that_was_found_bad_unless_told_so():
+    made = fixed()
+    for second in range(1, 40):
+        made.predict(state(second, (0, 0, 0)))
+        made.update(fix((0.0, 0.0, 100.0), stamp_ns=second * SECOND), state(second, (0, 0, 0), position=(300, 0, 100)))
+    assert made.witness.report.state is Consistency.BAD
+    spoofed = state(40.0, (0, 0, 0), position=(300, 0, 100))
+    made.take(StartAnew(stamp_ns=40 * SECOND, trust_gnss=False))
+    assert isinstance(made.predict(spoofed), Rejected)
+    made.take(StartAnew(stamp_ns=40 * SECOND, trust_gnss=True))
+    assert made.witness.report.state is Consistency.UNKNOWN
+    assert np.allclose(made.predict(spoofed).map_from_camera.translation, (300, 0, 100))

@@ -119,6 +119,8 @@ class AutopilotLink:
         self._open_ok = False
         self._peer_is_vehicle = False
         self.failure: BaseException | None = None
+        # When the thread came round last; ahead of now while it waits before it opens the device again.
+        self.beat_ns = clock.now_ns()
 
     def __enter__(self) -> AutopilotLink:
         self.start()
@@ -424,7 +426,7 @@ class AutopilotLink:
                     "open",
                     f"link endpoint {self._options.endpoint} can't be opened: {error}; trying again",
                 )
-                self._stop.wait(backoff_s)
+                self._pause(backoff_s)
                 backoff_s = min(2.0 * backoff_s, _BACKOFF_MAX_S)
                 continue
             logger.info("link open: %s", self._options.endpoint)
@@ -452,8 +454,12 @@ class AutopilotLink:
                 # A peer that accepts and hangs up at once must not be called upon without end.
                 if self._counts["messages"] > before:
                     backoff_s = _BACKOFF_MIN_S
-                self._stop.wait(backoff_s)
+                self._pause(backoff_s)
                 backoff_s = min(2.0 * backoff_s, _BACKOFF_MAX_S)
+
+    def _pause(self, seconds: float) -> None:
+        self.beat_ns = self._clock.now_ns() + round(seconds * _S)
+        self._stop.wait(seconds)
 
     def _serve(self, transport: Transport, wake_receiver: socket.socket) -> None:
         errors_in_a_row = 0
@@ -467,7 +473,7 @@ class AutopilotLink:
                     wake_receiver.recv(4096)
             if writable:
                 transport.flush()
-            now_ns = self._clock.now_ns()
+            self.beat_ns = now_ns = self._clock.now_ns()
             arrived = self._receive(transport, now_ns) if transport in readable else []
             if arrived:
                 last_heard_ns = now_ns
