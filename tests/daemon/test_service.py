@@ -254,7 +254,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @needs("dpkg-deb")
 def test_the_debian_package_has_all_in_its_place(wheel: Path, tmp_path: Path) -> None:
-    build = [sys.executable, str(ROOT / "packaging" / "build_deb.py"), "--out", str(tmp_path)]
+    build = [sys.executable, str(ROOT / "systemd" / "build_deb.py"), "--out", str(tmp_path)]
     done = subprocess.run(
         [*build, "--wheel", str(wheel), "--no-dependencies"], capture_output=True, text=True, check=False
     )

@@ -1,6 +1,6 @@
 """Build a Debian package: the daemon with all that it needs, for a computer that has no internet.
 
-    python packaging/build_deb.py --out dist
+    python systemd/build_deb.py --out dist
 
 Run it on the architecture and with the Python that the vehicle's Debian has (Debian 12: 3.11), as on a Raspberry Pi OS
 or in a container of it: dependencies are binary wheels, pinned by constraints.txt, and go into /opt/ortholoc-edge/lib,
