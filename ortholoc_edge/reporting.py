@@ -5,10 +5,11 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from ortholoc_edge.adapters import systemd
 from ortholoc_edge.adapters.bus import AutopilotRecord, Bus
-from ortholoc_edge.adapters.computer import ComputerReader
+from ortholoc_edge.adapters.computer import ComputerReader, ComputerStatus
 from ortholoc_edge.adapters.flight_log import FlightLog, LoggedStep
 from ortholoc_edge.adapters.mavlink import AutopilotLink, LinkOptions, Severity, Statistic, SystemStatus
 from ortholoc_edge.adapters.mavlink.audit import Level
@@ -22,6 +23,9 @@ from ortholoc_edge.pipeline.tracker import TrackerStatus
 from ortholoc_edge.pipeline.witness import Consistency, WitnessReport
 from ortholoc_edge.tiles.store import MapStore
 from ortholoc_edge.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from ortholoc_edge.adapters.page.ground_page import GroundPage, Health
 
 logger = logging.getLogger(__name__)
 
@@ -51,6 +55,7 @@ class Reporter:
         *,
         bus: Bus | None = None,
         log: FlightLog | None = None,
+        page: GroundPage | None = None,
         on_outcome: OutcomeListener | None = None,
     ) -> None:
         """
@@ -61,7 +66,7 @@ class Reporter:
         """
         self._link, self._vehicle, self._navigator, self._store = link, vehicle, navigator, store
         self._options, self._counts = options, counts
-        self._bus, self._log, self._on_outcome = bus, log, on_outcome
+        self._bus, self._log, self._page, self._on_outcome = bus, log, page, on_outcome
         self._computer = ComputerReader()
         self._checkup: Checkup | None = Checkup(link, options, lever_arm_m=lever_arm_m, ages=link.ages)
         self._findings_told: set[str] = set()
@@ -85,6 +90,7 @@ class Reporter:
             "map_files_damaged": len(self._store.damaged),
             "log_dropped": 0 if self._log is None else self._log.dropped,
             "bus_dropped": 0 if self._bus is None else self._bus.dropped,
+            "page_dropped": 0 if self._page is None else self._page.dropped,
             **{f"link.{name}": value for name, value in self._link.statistics().items()},
         }
 
@@ -97,6 +103,9 @@ class Reporter:
             self._log.put(frame, outcome, step)
         if self._bus is not None:
             self._bus.publish(outcome)
+        if self._page is not None:
+            _, state, circumstances = step or (None, None, None)
+            self._page.put(frame, outcome, state, circumstances)
         if self._on_outcome is not None:
             self._on_outcome(frame, outcome)
 
@@ -111,7 +120,10 @@ class Reporter:
         # First what steers: a defect in what is only told must not keep it from being done.
         self._switch_sources(self._navigator.tracker.witness.report.state, now_ns)
         self._report_autopilot(now_ns)
-        self._link.report_computer(self._computer.read())
+        computer = self._computer.read()
+        self._link.report_computer(computer)
+        if self._page is not None:
+            self._page.tell(self._health(now_ns, computer))
         if self._log is not None:
             self._log.note(now_ns, self.statistics())
         counts = self._counts
@@ -120,6 +132,22 @@ class Reporter:
             self._report_damage()
             self._report_audit(now_ns)
             self._report_origin(now_ns)
+
+    def _health(self, now_ns: int, computer: ComputerStatus) -> Health:
+        from ortholoc_edge.adapters.page.ground_page import Health
+
+        witness, ladder, vehicle = self._navigator.tracker.witness.report, self._navigator.ladder, self._link.vehicle
+        return Health(
+            now_ns=now_ns,
+            tracker=self._status(now_ns).value,
+            autopilot=autopilot_record(now_ns, self._link, witness, self._sources.on_vision),
+            vehicle=None if vehicle is None else f"{vehicle.autopilot.value} {vehicle.firmware}",
+            trouble=self._link.trouble(),
+            computer=computer,
+            rung=ladder.rung,
+            rungs=ladder.rungs,
+            statistics=self.statistics(),
+        )
 
     def _status(self, now_ns: int) -> TrackerStatus:
         """By the age of the last fix, not by what the last frame came to: a camera that hangs gives no frame."""

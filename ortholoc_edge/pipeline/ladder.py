@@ -33,6 +33,11 @@ class Ladder:
     def rung(self) -> int:
         return self._rung
 
+    @property
+    def rungs(self) -> int:
+        """How many there are."""
+        return self._last + 1
+
     def note(self, took_ms: float) -> None:
         """A frame on the present rung took so long."""
         if self._budget_ms is None:

@@ -12,7 +12,6 @@ import hashlib
 import hmac
 import logging
 import os
-import stat
 from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
@@ -21,6 +20,7 @@ import msgspec
 
 from ortholoc_edge.adapters.mavlink.codec import MavlinkMessage, dialect
 from ortholoc_edge.adapters.mavlink.options import LinkOptions
+from ortholoc_edge.adapters.secret import read_secret
 from ortholoc_edge.errors import ConfigError
 
 logger = logging.getLogger(__name__)

@@ -62,7 +62,7 @@ class Orthophoto:
         Raises: MapError, as `MapStore.read_colour`.
         """
         canvas = np.full((height, width, 3), _PAPER, dtype=np.uint8)
-        west, south, east, north = bounds
+        west, _, east, north = bounds
         gsd_m = (east - west) / width
         window = self._store.read_colour(bounds, gsd_m)
         if window is None:

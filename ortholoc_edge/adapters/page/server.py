@@ -100,6 +100,11 @@ class PageServer:
         return sum(client.streams for client in self._clients.values())
 
     @property
+    def newcomers(self) -> bool:
+        """Whether one of them got none yet."""
+        return any(client.streams and client.seen < 0 and not client.out for client in self._clients.values())
+
+    @property
     def clients(self) -> int:
         return len(self._clients)
 
