@@ -11,7 +11,7 @@ from ortholoc_edge.adapters.page.marks import Mark
 # In full, so many are kept, and so many sent to who opens the page; of a client that fell behind, the rest is in the
 # track at its next visit.
 _MARKS, _AT_ONCE = 400, 120
-# Of the way so far: places of fixes and of rejections. Beyond, every second of the older half goes.
+# Of the way so far: places of fixes and of rejections. Beyond, every second goes, and every second that comes.
 _MOST_PLACES = 4000
 
 # East, north, m; 1: a fix, 0: a rejection, at its prediction; ms of the daemon's clock.
@@ -28,6 +28,7 @@ class Board:
     def __init__(self) -> None:
         self._marks: deque[Mark] = deque(maxlen=_MARKS)
         self._track: list[Place] = []
+        self._every = 1
         self.ground_m: float | None = None
         self.last = -1
 
@@ -36,12 +37,12 @@ class Board:
         self.last = mark.n
         self._marks.append(mark)
         pose = mark.fix or mark.prior
-        if pose is None:
+        if pose is None or mark.n % self._every:
             return
         self._track.append((pose.at[0], pose.at[1], int(mark.fix is not None), round(mark.t)))
         if len(self._track) > _MOST_PLACES:
-            half = len(self._track) // 2
-            self._track[:half] = self._track[:half:2]
+            self._every *= 2
+            self._track = self._track[::2]
 
     def since(self, seen: int) -> list[Mark]:
         """Outcomes after a number, the last `_AT_ONCE` of them at most; only the last with what the camera sees."""

@@ -16,7 +16,7 @@ const KEPT_MARKS = 200, KEPT_PLACES = 6000, SHOWN_REJECTIONS = 8;
 
 const byId = (id) => document.getElementById(id);
 const known = {
-  session: null, scene: null, marks: [], track: [], health: null, picture: null,
+  session: null, scene: null, marks: [], track: [], every: 1, health: null, picture: null,
   /* The daemon's clock less ours, as the least delayed event had it; and when the last came, on ours. */
   offset: null, heard: null, since: performance.now(), awake: true,
 };
@@ -56,17 +56,19 @@ function hear(event) {
   if (event.scene) {
     known.marks = [];
     known.track = event.track;
+    known.every = 1;
     setScene(event.scene);
   }
   for (const mark of event.marks) {
     known.marks.push(mark);
     const pose = mark.fix || mark.prior;
-    if (pose) known.track.push([pose.at[0], pose.at[1], mark.fix ? 1 : 0, mark.t]);
+    // Of the last ones all are drawn, of those before as many as a long flight leaves room for.
+    if (pose && mark.n % known.every === 0) known.track.push([pose.at[0], pose.at[1], mark.fix ? 1 : 0, mark.t]);
   }
   known.marks.splice(0, known.marks.length - KEPT_MARKS);
   if (known.track.length > KEPT_PLACES) {
-    const half = KEPT_PLACES / 2;
-    known.track = [...known.track.slice(0, half).filter((_, k) => k % 2 === 0), ...known.track.slice(half)];
+    known.every *= 2;
+    known.track = known.track.filter((_, k) => k % 2 === 0);
   }
   if (event.health) known.health = event.health;
   if (event.picture) setPicture(event.picture);
@@ -204,6 +206,12 @@ function frameNote() {
   return `${words(age(picture.t))} ago, ${what}`;
 }
 
+function way() {
+  const first = known.marks.length ? known.marks[0].t : Infinity;
+  const recent = known.marks.map((mark) => [mark.fix || mark.prior, mark.fix ? 1 : 0]).filter(([pose]) => pose);
+  return [...known.track.filter((place) => place[3] < first), ...recent.map(([pose, isFix]) => [...pose.at.slice(0, 2), isFix])];
+}
+
 function renderMap(state) {
   if (!map) return;
   const { marks } = known;
@@ -214,7 +222,7 @@ function renderMap(state) {
   if (isOld) note.textContent = `last fix ${words(age(fix.t))} old`;
   const isNow = last !== null && state.kind !== "bad";
   map.show({
-    track: known.track,
+    track: way(),
     pose: fix ? fix.fix : null,
     prior: isNow ? last.prior || null : null,
     believed: isNow ? last.believed || null : null,
