@@ -135,7 +135,8 @@ function verdict() {
   const fix = lastFix();
   const refused = last.reason ? REASONS[last.reason] || last.reason : "";
   if (!fix) return { kind: "warn", word: "NO FIX YET", why: refused, old: true };
-  if (age(fix.t) > OLD_FIX_MS) return { kind: "warn", word: `NO FIX ${words(age(fix.t))}`, why: refused, old: true };
+  if (age(fix.t) > OLD_FIX_MS) return { kind: "warn", word: `NO FIX ${words(age(fix.t))}`, old: true,
+    why: refused || "frames take too long" };
   return { kind: "good", word: "FIX", why: `${words(age(fix.t))} old, \u03c3 ${metres(sigmaOf(fix.fix))}`, old: false };
 }
 
@@ -157,9 +158,9 @@ function badges(state) {
   const { autopilot } = health;
   if (!autopilot.connected) list.push(["bad", "LINK LOST"]);
   else list.push(["good", "link up"]);
-  const fusion = { fused: ["good", "autopilot uses the fixes"], rejected: ["bad", "AUTOPILOT REJECTS FIXES"],
-    ignored: ["warn", "autopilot ignores the fixes"] }[autopilot.fusion];
-  if (autopilot.connected) list.push(fusion || ["calm", "autopilot: unknown whether it uses them"]);
+  const fusion = { fused: ["good", "fixes fused"], rejected: ["bad", "FIXES REJECTED"],
+    ignored: ["warn", "fixes ignored"] }[autopilot.fusion];
+  if (autopilot.connected) list.push(fusion || ["calm", "fixes: use unknown"]);
   const gnss = { ok: ["good", "GNSS agrees"], suspect: ["warn", "GNSS suspect"], bad: ["bad", "GNSS CONTRADICTS"] }[autopilot.gnss];
   if (gnss) list.push(gnss);
   const { computer } = health;
@@ -182,7 +183,7 @@ function element(tag, className, text) {
 
 function render() {
   const state = verdict();
-  document.body.className = state.old ? "old" : "";
+  document.body.className = state.kind === "bad" || state.kind === "" ? "dead" : "";
   const box = byId("state");
   box.className = state.kind;
   setText("state-word", state.word);
@@ -243,11 +244,11 @@ function renderFigures(state) {
   const { health, marks } = known;
   const fix = lastFix(), last = marks[marks.length - 1];
   const figures = [];
-  const add = (name, value, note = "", kind = "") => figures.push([name, value, note, kind]);
+  const add = (name, value, note = "", kind = "", ofFix = false) => figures.push([name, value, note, kind, ofFix]);
   if (fix) {
-    add("1 \u03c3 across", metres(sigmaOf(fix.fix)), `height \u00b1 ${metres(fix.fix.sigma_h)}`, state.old ? "" : "plain");
-    add("Last fix", `${words(age(fix.t))} ago`, `quality ${Math.round(100 * (fix.quality || 0))} %`);
-    add("Inliers", `${fix.inliers}`, `of ${fix.matches} matches, rms ${fix.rms_px} px`);
+    add("1 \u03c3 across", metres(sigmaOf(fix.fix)), `height \u00b1 ${metres(fix.fix.sigma_h)}`, "", true);
+    add("Last fix", `${words(age(fix.t))} ago`, `quality ${Math.round(100 * (fix.quality || 0))} %`, "", true);
+    add("Inliers", `${fix.inliers}`, `of ${fix.matches} matches, rms ${fix.rms_px} px`, "", true);
   } else {
     add("1 \u03c3 across", "\u2013", "no fix yet");
     add("Last fix", "none");
@@ -289,10 +290,10 @@ function renderFigures(state) {
   if (fix && known.scene) {
     const [east, north] = known.scene.origin;
     add("Camera at", `${(east + fix.fix.at[0]).toFixed(1)} E`, `${(north + fix.fix.at[1]).toFixed(1)} N, height ` +
-      `${fix.fix.at[2].toFixed(1)} m (map's)`);
+      `${fix.fix.at[2].toFixed(1)} m (map's)`, "long", true);
   }
-  byId("figures").replaceChildren(...figures.map(([name, value, note, kind]) => {
-    const box = element("div", "figure");
+  byId("figures").replaceChildren(...figures.map(([name, value, note, kind, ofFix]) => {
+    const box = element("div", ofFix && state.old ? "figure old" : "figure");
     box.append(element("h3", "", name), element("b", kind, value), element("p", "", note));
     return box;
   }));
@@ -304,19 +305,24 @@ function renderStages() {
   const box = byId("stages");
   setText("stages-note", taken.length ? `median of the last ${taken.length}, ms` : "none yet");
   if (!taken.length) return box.replaceChildren();
-  const names = [...new Set(taken.flatMap(Object.keys))].filter((name) => name !== "total");
+  // Structural matching is one stage with the others inside.
+  const sums = ["structural", "total"];
+  const names = [...new Set(taken.flatMap(Object.keys))].filter((name) => !sums.includes(name));
   const median = (name) => {
     const values = taken.map((took) => took[name] || 0).sort((a, b) => a - b);
     return values[Math.floor(values.length / 2)];
   };
   const total = median("total"), budget = known.scene.budget_ms || total;
   const top = Math.max(total, budget);
-  for (const name of [...names.sort((a, b) => median(b) - median(a)), "total"]) {
-    const label = element("span", name === "total" ? "all" : "", name === "total" ? "all" : name.replaceAll("_", " "));
+  const shown = names.filter((name) => median(name) >= 0.05).sort((a, b) => median(b) - median(a));
+  for (const name of [...shown, ...(median("structural") ? sums : ["total"])]) {
+    const isSum = sums.includes(name);
+    const label = element("span", isSum ? "all" : "", { structural: "structural, in all", total: "frame, in all" }[name]
+      || name.replaceAll("_", " "));
     const bar = element("div", "bar"), fill = element("i", name === "total" && total > budget ? "over" : "");
     fill.style.width = `${Math.min(100, 100 * median(name) / top).toFixed(1)}%`;
     bar.append(fill);
-    rows.push(label, bar, element("span", name === "total" ? "all" : "", median(name).toFixed(median(name) < 10 ? 1 : 0)));
+    rows.push(label, bar, element("span", isSum ? "all" : "", median(name).toFixed(median(name) < 10 ? 1 : 0)));
   }
   return box.replaceChildren(...rows);
 }
