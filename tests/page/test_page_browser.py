@@ -240,17 +240,23 @@ def test_what_is_old_is_never_shown_as_fresh(browser: Chromium, flying: Feeder) 
             feed()
             time.sleep(0.1)
 
-    # Frames go on, without a fix; and the autopilot is silent.
     def refused() -> None:
         flying.reject(40.0, 0.0)
-        flying.health(connected=False, fusion="unknown", trouble="autopilot silent")
+        flying.health()
 
     until("document.getElementById('state-word').innerText.startsWith('NO FIX')", "no fix", refused)
     assert "the map fits here hardly better" in tab.text("#state")
-    assert "LINK LOST" in tab.text("#badges") and "autopilot silent" in tab.text("#figures")
     assert "last fix" in tab.text("#map-old"), "also on the map"
     assert tab.run("map.layers.old").endswith("old")
     assert tab.run("document.querySelectorAll('.figure.old').length") == 4, "the figures of the fix"
+
+    def cut() -> None:
+        flying.fix(40.0, 0.0)
+        flying.health(connected=False, fusion="unknown", trouble="link endpoint serial:/dev/ttyAMA0 is not open")
+
+    until("document.getElementById('state-word').innerText === 'LINK LOST'", "no link", cut)
+    assert "LINK LOST" in tab.text("#badges") and "ttyAMA0 is not open" in tab.text("#figures")
+    assert "fix, 0." in tab.text("#state"), "the camera still finds it"
     until("document.getElementById('state-word').innerText === 'NO FRAMES'", "no frames", flying.health)
     assert tab.run("map.layers.prior") is None, "a prediction of long ago"
     until("document.getElementById('state-word').innerText === 'STANDS STILL'", "standing still", lambda: None)

@@ -110,34 +110,34 @@ function setPicture(picture) {
 
 /* -- what it comes to -- */
 
+/* dead: nothing that is shown is of now. old: the fix is not. */
 function verdict() {
+  const dead = (word, why, kind = "bad") => ({ kind, word, why, old: true, dead: true });
   if (known.heard === null) {
     const waited = ours() - known.since;
-    return waited < SILENT_MS ? { kind: "", word: "CONNECTING", why: "", old: true }
-      : { kind: "bad", word: "NO CONTACT", why: `nothing heard from the drone for ${words(waited)}`, old: true };
+    return waited < SILENT_MS ? dead("CONNECTING", "", "") : dead("NO CONTACT", `nothing heard from the drone for ${words(waited)}`);
   }
   const silent = known.awake ? ours() - known.heard : SILENT_MS + 1;
   if (silent > SILENT_MS) {
-    return { kind: "bad", word: "NO CONTACT", why: `nothing heard from the drone for ${words(ours() - known.heard)};` +
-      " what stands below is old", old: true };
+    return dead("NO CONTACT", `nothing heard from the drone for ${words(ours() - known.heard)}; what stands below is old`);
   }
   const { health, marks } = known;
-  if (!health) return { kind: "warn", word: "STARTING", why: "the daemon is up, no frame was taken yet", old: true };
+  if (!health) return dead("STARTING", "the daemon is up, no frame was taken yet", "warn");
   const still = age(health.now_ns / 1e6);
-  if (still > STILL_MS) {
-    return { kind: "bad", word: "STANDS STILL", why: `the daemon's frame path does nothing for ${words(still)}`, old: true };
-  }
+  if (still > STILL_MS) return dead("STANDS STILL", `the daemon's frame path does nothing for ${words(still)}`);
   const last = marks[marks.length - 1];
-  if (!last || age(last.t) > NO_FRAMES_MS + (last.late_ms || 0)) {
-    return { kind: "bad", word: "NO FRAMES", why: last ? `the camera is silent for ${words(age(last.t))}`
-      : "the camera gave no frame yet", old: true };
+  if (!last) return dead("NO FRAMES", "the camera gave no frame yet");
+  if (age(last.t) > NO_FRAMES_MS + (last.late_ms || 0)) {
+    return dead("NO FRAMES", `the camera is silent for ${words(age(last.t))}`);
   }
-  const fix = lastFix();
+  const fix = lastFix(), old = !fix || age(fix.t) > OLD_FIX_MS;
   const refused = last.reason ? REASONS[last.reason] || last.reason : "";
-  if (!fix) return { kind: "warn", word: "NO FIX YET", why: refused, old: true };
-  if (age(fix.t) > OLD_FIX_MS) return { kind: "warn", word: `NO FIX ${words(age(fix.t))}`, old: true,
-    why: refused || "frames take too long" };
-  return { kind: "good", word: "FIX", why: `${words(age(fix.t))} old, \u03c3 ${metres(sigmaOf(fix.fix))}`, old: false };
+  const state = !fix ? { kind: "warn", word: "NO FIX YET", why: refused }
+    : old ? { kind: "warn", word: `NO FIX ${words(age(fix.t))}`, why: refused || "frames take too long" }
+      : { kind: "good", word: "FIX", why: `${words(age(fix.t))} old, \u03c3 ${metres(sigmaOf(fix.fix))}` };
+  if (health.autopilot.connected) return { ...state, old, dead: false };
+  // Whatever the camera finds, nobody steers by it.
+  return { kind: "bad", word: "LINK LOST", why: `autopilot not heard; ${state.word.toLowerCase()}, ${state.why}`, old, dead: false };
 }
 
 function lastFix() {
@@ -156,13 +156,12 @@ function badges(state) {
   const list = [], { health } = known;
   if (!health) return list;
   const { autopilot } = health;
-  if (!autopilot.connected) list.push(["bad", "LINK LOST"]);
-  else list.push(["good", "link up"]);
+  list.push(autopilot.connected ? ["good", "link up"] : ["bad", "LINK LOST"]);
   const fusion = { fused: ["good", "fixes fused"], rejected: ["bad", "FIXES REJECTED"],
     ignored: ["warn", "fixes ignored"] }[autopilot.fusion];
   if (autopilot.connected) list.push(fusion || ["calm", "fixes: use unknown"]);
   const gnss = { ok: ["good", "GNSS agrees"], suspect: ["warn", "GNSS suspect"], bad: ["bad", "GNSS CONTRADICTS"] }[autopilot.gnss];
-  if (gnss) list.push(gnss);
+  if (gnss && autopilot.connected) list.push(gnss);
   const { computer } = health;
   if (computer.is_under_voltage) list.push(["bad", "UNDER-VOLTAGE"]);
   if (computer.is_throttled) list.push(["warn", "throttled"]);
@@ -183,7 +182,7 @@ function element(tag, className, text) {
 
 function render() {
   const state = verdict();
-  document.body.className = state.kind === "bad" || state.kind === "" ? "dead" : "";
+  document.body.className = state.dead ? "dead" : "";
   const box = byId("state");
   box.className = state.kind;
   setText("state-word", state.word);
@@ -221,7 +220,7 @@ function renderMap(state) {
   const note = byId("map-old");
   note.hidden = !isOld;
   if (isOld) note.textContent = `last fix ${words(age(fix.t))} old`;
-  const isNow = last !== null && state.kind !== "bad";
+  const isNow = last !== null && !state.dead;
   map.show({
     track: way(),
     pose: fix ? fix.fix : null,
