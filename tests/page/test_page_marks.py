@@ -44,7 +44,8 @@ def a_fix(pose: Rigid3, covariance: FloatArray | None = None, points: int = 10) 
     return Fix(
         stamp_ns=5_000_000_123, map_from_camera=pose, camera=CAMERA,
         covariance=np.eye(6) * 0.25 if covariance is None else covariance, quality=0.5, matches=200, inliers=100,
-        rms_px=1.234567, adhop_accepted=True, query_px=px, points_map=on_ground, timings_ms={"match": 12.3456, "total": 20.0},
+        rms_px=1.234567, adhop_accepted=True, query_px=px, points_map=on_ground,
+        timings_ms={"match": 12.3456, "total": 20.0},
     )  # fmt: skip
 
 

@@ -459,3 +459,22 @@ function fillLegend(list, entries = LEGEND) {
     list.append(item);
   }
 }
+
+/* Inliers on a frame, each [u, v, u where the pose puts it, v, ...], and ten times the way between the two. */
+function drawInliers(pen, inliers) {
+  for (const [u, v, putU, putV] of inliers) {
+    pen.beginPath();
+    pen.moveTo(u, v);
+    pen.lineTo(u + 10 * (putU - u), v + 10 * (putV - v));
+    pen.lineWidth = 1.6;
+    pen.strokeStyle = "#d4006a";
+    pen.stroke();
+    pen.beginPath();
+    pen.arc(u, v, 2.4, 0, 7);
+    pen.fillStyle = INK.point;
+    pen.fill();
+    pen.lineWidth = 1;
+    pen.strokeStyle = "#000";
+    pen.stroke();
+  }
+}

@@ -352,21 +352,7 @@ function drawFrame() {
   const pen = canvas.getContext("2d");
   pen.setTransform(2, 0, 0, 2, 0, 0);
   pen.drawImage(picture.image, 0, 0, width, height);
-  for (const [u, v, putU, putV] of picture.inliers) {
-    pen.beginPath();
-    pen.moveTo(u, v);
-    pen.lineTo(u + 10 * (putU - u), v + 10 * (putV - v));
-    pen.lineWidth = 1.6;
-    pen.strokeStyle = "#d4006a";
-    pen.stroke();
-    pen.beginPath();
-    pen.arc(u, v, 2.4, 0, 7);
-    pen.fillStyle = "#ffd400";
-    pen.fill();
-    pen.lineWidth = 1;
-    pen.strokeStyle = "#000";
-    pen.stroke();
-  }
+  drawInliers(pen, picture.inliers);
 }
 
 /* -- the line to the daemon -- */
