@@ -19,8 +19,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "run",
         help="the daemon: camera to autopilot",
         description="Localizes camera frames and sends vision position estimates to the autopilot until SIGTERM or "
-        "SIGINT, or the end of a folder or video. config/example.toml explains every key. With [page] enabled it serves "
-        "a page for the ground crew, at http://127.0.0.1:8080 if nothing else is said (docs/page.md).",
+        "SIGINT, or the end of a folder or video. config/example.toml explains every key. With [page] enabled "
+        "it serves a page for the ground crew, at http://127.0.0.1:8080 if nothing else is said (docs/page.md).",
     )
     parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="TOML")
     parser.set_defaults(run=run)

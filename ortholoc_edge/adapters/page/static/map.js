@@ -158,7 +158,8 @@ class FlightMap {
   paint() {
     const pen = this.canvas.getContext("2d");
     const { track, truth, points, pose, prior, believed, gnss, old } = this.layers;
-    const middle = pose || prior;
+    // An old place is not where the vehicle is.
+    const middle = old && prior ? prior : pose || prior;
     if (this.follows && middle) this.centre = [middle.at[0], middle.at[1]];
     pen.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
     pen.fillStyle = "#e2e2e2";
