@@ -1,6 +1,7 @@
 """What the page costs the frame path: frames localized with it off, on, watched, and attacked, in turns.
 
     python tests/page/page_load.py [--rounds 12] [--frames 25] [--rate 5]
+    python tests/page/page_load.py --memory
 
 Rounds of all modes alternate, so that whatever else the computer does falls on all alike. Clients are processes of
 their own. Prints a table: wall time and CPU time of the localizing thread per frame, and CPU time of the page's thread.
@@ -103,7 +104,62 @@ def rss_mib() -> float:
     return 0.0
 
 
+def memory() -> None:
+    """Resident memory of a process without a localizer, as the page comes to it and is watched."""
+    from ortholoc_sim import demo_pack_path
+
+    from ortholoc_edge.geometry.camera import Camera
+    from ortholoc_edge.pipeline.frame import Frame
+    from ortholoc_edge.pipeline.outcome import Reason, Rejected
+    from ortholoc_edge.tiles.pack import Pack
+    from ortholoc_edge.tiles.store import MapStore
+
+    store = MapStore(Pack.open(demo_pack_path()))
+    store.ground_near(np.array(store.bounds).reshape(2, 2).mean(axis=0))
+    image = np.random.default_rng(1).integers(0, 255, (960, 1280, 3), dtype=np.uint8)
+    before = rss_mib()
+    from ortholoc_edge.adapters.page.ground_page import GroundPage
+    from ortholoc_edge.adapters.page.options import Listen
+    from ortholoc_edge.clock import SystemClock
+
+    about = {"matcher": "structural", "budget_ms": 200.0, "vehicle": "load"}
+    camera = Camera.from_focal(1280, 960, 900.0)
+    clock = SystemClock()
+    page = GroundPage(Listen("127.0.0.1", 0, False, None, frozenset()), clock, store, camera, None, about)
+    while page.address is None:
+        time.sleep(0.01)
+    idle = rss_mib()
+    stop = multiprocessing.Event()
+    port = int(page.address.rpartition(":")[2])
+    clients = [multiprocessing.Process(target=watch, args=(port, stop)) for _ in range(4)]
+    for client in clients:
+        client.start()
+    for number in range(150):
+        stamp_ns = clock.now_ns()
+        page.put(Frame(stamp_ns, image, str(number)), Rejected(stamp_ns, Reason.LATE, "x" * 40), None, None)
+        time.sleep(0.1)
+    watched = rss_mib()
+    stop.set()
+    for client in clients:
+        client.join()
+    page.close()
+    sys.stdout.write(f"RSS MiB: {before:.1f} without the page, {idle:.1f} with it, {watched:.1f} watched by four\n")
+
+
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rounds", type=int, default=12)
+    parser.add_argument("--frames", type=int, default=25)
+    parser.add_argument("--rate", type=float, default=5.0)
+    parser.add_argument("--memory", action="store_true")
+    args = parser.parse_args()
+    if args.memory:
+        memory()
+    else:
+        latency(args)
+
+
+def latency(args: argparse.Namespace) -> None:
     from replay import rendered
 
     from ortholoc_edge.adapters.computer import ComputerReader
@@ -115,11 +171,6 @@ def main() -> None:
     from ortholoc_edge.tiles.pack import Pack
     from ortholoc_edge.tiles.store import MapStore
 
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=12)
-    parser.add_argument("--frames", type=int, default=25)
-    parser.add_argument("--rate", type=float, default=5.0)
-    args = parser.parse_args()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     poses = [rendered.pose(200.0 + 12.0 * k, 180.0 + 8.0 * k) for k in range(8)]
     pictures = [rendered.picture(pose) for pose in poses]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from ortholoc_edge.adapters.bus import AutopilotRecord
 from ortholoc_edge.adapters.computer import ComputerStatus
 from ortholoc_edge.adapters.page.ground_page import GroundPage, Health
 from ortholoc_edge.adapters.page.options import Listen
+from ortholoc_edge.adapters.page.report import FlightRecord
 from ortholoc_edge.clock import SystemClock
 from ortholoc_edge.geometry import frames, rotation
 from ortholoc_edge.geometry.rigid import Rigid3
@@ -24,7 +26,7 @@ from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.prior import PosePrior
 from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.store import MapStore
-from page.test_page_marks import CAMERA, NADIR, a_fix
+from page.test_page_marks import CAMERA, NADIR, a_fix, down
 
 HOSTILE = "</script><img src=x onerror=document.title='owned'>"
 
@@ -332,3 +334,51 @@ def test_another_site_gets_nothing(browser: Chromium, flying: Feeder, store: Map
     }})"""
     assert tab.run(image) == "refused"
     other.page.close()
+
+
+# -- the report ----------------------------------------------------------------------------------------
+
+
+def test_a_report_is_one_file_that_steps_through_the_flight(browser: Chromium, store: MapStore, tmp_path: Path) -> None:
+    west, south, east, north = store.bounds
+    middle = np.array([(west + east) / 2, (south + north) / 2, 0.0])
+    record = FlightRecord.over(store, CAMERA, NADIR)
+    image = np.full((CAMERA.height, CAMERA.width, 3), 90, np.uint8)
+    for k in range(6):
+        low = a_fix(down(90.0))
+        pose = Rigid3(low.map_from_camera.rotation, middle + np.array([20.0 * k, 5.0, 100.0]))
+        shift = np.array([*(pose.translation - low.map_from_camera.translation)[:2], 0.0])
+        fix = Fix(**{**_fields(low), "map_from_camera": pose, "points_map": low.points_map + shift})
+        outcome: Outcome = Rejected(0, Reason.AMBIGUOUS, HOSTILE, 0.7, 0.6) if k == 3 else fix
+        error = None if k == 3 else (0.25 + k, 0.5)
+        record.add(
+            f"frame_{k}", outcome, prior=PosePrior(pose, np.eye(6)), truth=pose, error=error,
+            image=image if k != 2 else None,
+        )  # fmt: skip
+    page = record.page(store, f"a flight {HOSTILE}", ["a note"], "recall 100 %")
+    assert page is not None
+    path = tmp_path / "report.html"
+    path.write_text(page, encoding="utf-8")
+    tab = browser.tab(390, 844, mobile=True)
+    tab.goto(path.as_uri())
+    assert "fix, 1 σ 0.50 m across" in tab.text("#what") and "off the truth by 0.25 m" in tab.text("#what")
+    assert tab.text("#name") == "1 of 6: frame_0" and "recall 100 %" in tab.text("pre")
+    assert HOSTILE in tab.text("h1")
+    for _ in range(3):
+        tab.run("node('after').click()")
+    assert "no fix: ambiguous" in tab.text("#what") and "measured 0.7, limit 0.6" in tab.text("#what")
+    assert HOSTILE in tab.text("#what") and tab.run("document.title") == f"a flight {HOSTILE}"
+    assert tab.run("map.layers.pose === null && map.layers.prior !== null")
+    assert tab.run("map.layers.track.map((place) => place[2])") == [1, 1, 1, 0, 1, 1]
+    tab.run("choose(2)")
+    assert not tab.run("node('no-picture').hidden") and tab.run("node('frame').hidden")
+    tab.wait_for("map.scene.picture.image.complete && map.scene.picture.image.naturalWidth > 100", "the orthophoto")
+    assert tab.run("document.documentElement.scrollWidth") <= 390
+    assert tab.console == []
+
+
+def test_a_flight_beside_the_map_has_no_report(store: MapStore) -> None:
+    record = FlightRecord.over(store, CAMERA)
+    assert record.page(store, "nothing", [], "") is None
+    record.add("far", a_fix(down(0.0)), prior=None, truth=None, error=None, image=None)
+    assert record.page(store, "far away", [], "") is None
