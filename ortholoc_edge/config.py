@@ -20,6 +20,7 @@ from ortholoc_edge.adapters.bus import BusOptions
 from ortholoc_edge.adapters.camera import CameraOptions
 from ortholoc_edge.adapters.flight_log import LogOptions
 from ortholoc_edge.adapters.mavlink import GimbalSelection, LinkOptions
+from ortholoc_edge.adapters.page.options import PageOptions
 from ortholoc_edge.errors import ConfigError
 from ortholoc_edge.geometry import frames, rotation
 from ortholoc_edge.geometry.arrays import FloatArray
@@ -197,6 +198,7 @@ class Config(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     timing: TimingOptions = field(default_factory=TimingOptions)
     log: LogOptions = field(default_factory=LogOptions)
     bus: BusOptions = field(default_factory=BusOptions)
+    page: PageOptions = field(default_factory=PageOptions)
 
     @property
     def reads_features(self) -> bool:

@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 from ortholoc_edge.adapters import systemd
 from ortholoc_edge.adapters.bus import Bus
@@ -45,6 +45,9 @@ from ortholoc_edge.tiles.georeference import Georeference
 from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.store import MapStore
 from ortholoc_edge.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from ortholoc_edge.adapters.page.ground_page import GroundPage
 
 logger = logging.getLogger(__name__)
 
@@ -180,6 +183,7 @@ class Daemon:
                 if config.bus.enabled
                 else None
             )
+            page = resources.enter_context(closing(self._ground_page(config))) if config.page.enabled else None
             self._reporter = Reporter(
                 self._link,
                 config.link,
@@ -193,6 +197,7 @@ class Daemon:
                 unix_minus_stamp_ns=self._unix_minus_stamp_ns,
                 bus=self._bus,
                 log=self._log,
+                page=page,
                 on_outcome=on_outcome,
             )
             self._frames = resources.enter_context(closing(frames or open_source(config.camera, self._clock)))
@@ -269,6 +274,20 @@ class Daemon:
             started_ns=now_ns,
             unix_minus_stamp_ns=self._unix_minus_stamp_ns(),
         )
+
+    def _ground_page(self, config: Config) -> GroundPage:
+        # Not at the top: a vehicle without a page needs none of it.
+        from ortholoc_edge.adapters.page.ground_page import GroundPage
+        from ortholoc_edge.adapters.page.options import checked
+
+        fixed = config.mount.body_from_camera() if config.mount.gimbal_selection() is None else None
+        about = {
+            "matcher": self._matcher.name,
+            "budget_ms": config.timing.budget_ms,
+            "vehicle": config.bus.vehicle,
+        }
+        listen = checked(config.page, os.environ)
+        return GroundPage(listen, self._clock, self._store, config.intrinsics.camera(), fixed, about)
 
     @property
     def link(self) -> AutopilotLink:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from ortholoc_edge.adapters import systemd
 from ortholoc_edge.adapters.bus import Bus
@@ -31,6 +32,9 @@ from ortholoc_edge.pipeline.tracker import TrackerStatus
 from ortholoc_edge.pipeline.witness import Consistency, WitnessReport
 from ortholoc_edge.tiles.store import MapStore
 from ortholoc_edge.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from ortholoc_edge.adapters.page.ground_page import GroundPage, Health
 
 logger = logging.getLogger(__name__)
 
@@ -63,6 +67,7 @@ class Reporter:
         unix_minus_stamp_ns: Callable[[], int],
         bus: Bus | None = None,
         log: FlightLog | None = None,
+        page: GroundPage | None = None,
         on_outcome: OutcomeListener | None = None,
     ) -> None:
         """
@@ -76,7 +81,7 @@ class Reporter:
         """
         self._link, self._vehicle, self._navigator, self._store = link, vehicle, navigator, store
         self._options, self._counts = options, counts
-        self._bus, self._log, self._on_outcome = bus, log, on_outcome
+        self._bus, self._log, self._page, self._on_outcome = bus, log, page, on_outcome
         self._commander, self._replaced = commander, replaced
         self._unix_minus_stamp_ns = unix_minus_stamp_ns
         self._started_ns: int | None = None
@@ -109,6 +114,7 @@ class Reporter:
             "log_dropped": 0 if self._log is None else self._log.dropped,
             "bus_dropped": 0 if self._bus is None else self._bus.dropped,
             "commands_refused": 0 if self._bus is None else self._bus.refused,
+            "page_dropped": 0 if self._page is None else self._page.dropped,
             **{f"link.{name}": value for name, value in self._link.statistics().items()},
         }
 
@@ -122,6 +128,9 @@ class Reporter:
         self._last_outcome = outcome
         if self._bus is not None:
             self._publish_on(self._bus, frame, outcome, step)
+        if self._page is not None:
+            _, state, circumstances = step or (None, None, None)
+            self._page.put(frame, outcome, state, circumstances)
         if self._on_outcome is not None:
             self._on_outcome(frame, outcome)
 
@@ -155,6 +164,8 @@ class Reporter:
         if self._bus is not None:
             self.publish_state(now_ns)
             self._bus.publish(self._health(now_ns, computer))
+        if self._page is not None:
+            self._page.tell(self._page_health(now_ns, computer))
         if self._log is not None:
             self._log.note(now_ns, self.statistics())
         counts = self._counts
@@ -165,6 +176,23 @@ class Reporter:
             self._report_damage()
             self._report_audit(now_ns)
             self._report_origin(now_ns)
+
+    def _page_health(self, now_ns: int, computer: ComputerStatus) -> Health:
+        from ortholoc_edge.adapters.page.ground_page import Health
+
+        witness, ladder, vehicle = self._navigator.tracker.witness.report, self._navigator.ladder, self._link.vehicle
+        unix_ns = now_ns + self._unix_minus_stamp_ns()
+        return Health(
+            now_ns=now_ns,
+            tracker=self._status(now_ns).value,
+            autopilot=autopilot_message(now_ns, unix_ns, self._link, witness, self._sources.on_vision),
+            vehicle=None if vehicle is None else f"{vehicle.autopilot.value} {vehicle.firmware}",
+            trouble=self._link.trouble(),
+            computer=computer,
+            rung=ladder.rung,
+            rungs=ladder.rungs,
+            statistics=self.statistics(),
+        )
 
     def _status(self, now_ns: int) -> TrackerStatus:
         """By the age of the last fix, not by what the last frame came to: a camera that hangs gives no frame."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Iterable
 from contextlib import nullcontext
 from dataclasses import replace
@@ -14,6 +15,7 @@ from tqdm import tqdm
 
 from ortholoc_edge import __version__
 from ortholoc_edge.adapters.flight_log import libraries
+from ortholoc_edge.adapters.page.report import MOST_PICTURES, FlightRecord
 from ortholoc_edge.bench import report, sequence
 from ortholoc_edge.bench.draw import write_png
 from ortholoc_edge.bench.flight_log import compare, log_files, read_frames, read_header, repeat
@@ -85,7 +87,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--seed", type=seed, default=0, help="of all noise (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="write frames.jsonl, overlays/*.png, track.png and summary.json there"
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="write frames.jsonl, overlays/*.png, track.png, summary.json and report.html there",
     )
     matcher_options.add(parser)
     matcher_options.add_features(parser)
@@ -164,37 +169,52 @@ def _replay(args: argparse.Namespace) -> int:
     matcher = matcher_options.matcher(args)
     writer = report.FrameWriter(args.out) if args.out else None
     results: list[FrameResult] = []
+    record: FlightRecord | None = None
 
     def collect(found: Iterable[FrameResult], total: int) -> None:
-        for result in tqdm(found, total=total, desc=args.sequence.name, unit="frame"):
+        for number, result in enumerate(tqdm(found, total=total, desc=args.sequence.name, unit="frame")):
             if writer is not None:
                 writer.write(result)
+            if record is not None:
+                is_kept = number % math.ceil(total / MOST_PICTURES) == 0
+                record.add(
+                    result.name, result.outcome, prior=result.prior, truth=result.truth,
+                    error=None if result.error is None else (result.error.te_m, result.error.re_deg),
+                    image=result.image if is_kept else None,
+                )  # fmt: skip
             # The picture is written; a long sequence must not pile up in memory.
             results.append(replace(result, image=None))
 
+    pack_name = SAMPLES_PACK if args.pack is None else str(args.pack)
     try:
         with _store(args) if args.pack is not None else nullcontext() as store:
             if samples:
                 collect(run_samples(samples, matcher, options, kind, noise, args.seed, store), len(samples))
             elif store is not None:
                 recorded = sequence.read_flight(args.sequence)
+                if args.out and recorded:
+                    record = FlightRecord.over(store, recorded[0].camera)
                 collect(run_flight(recorded, store, matcher, options, kind, noise, args.seed), len(recorded))
             if args.out and store is not None:
                 caption = f"{args.sequence.name}: {matcher.name}, prior {kind}"
                 write_png(args.out / "track.png", report.track_picture(store, results, caption))
-        pack_name = SAMPLES_PACK if args.pack is None else str(args.pack)
+            summary = summarise(
+                results,
+                name=str(args.sequence),
+                pack=pack_name,
+                matcher=matcher,
+                prior=kind,
+                adhop=options.adhop,
+                seed=args.seed,
+            )
+            if record is not None and store is not None:
+                notes = [f"{args.sequence.name} on {pack_name}, replayed by ortholoc-edge {__version__}"]
+                page = record.page(store, f"Replay of {args.sequence.name}", notes, report.table(summary))
+                if page is not None:
+                    _write(args.out / "report.html", page.encode())
     finally:
         if writer is not None:
             writer.close()
-    summary = summarise(
-        results,
-        name=str(args.sequence),
-        pack=pack_name,
-        matcher=matcher,
-        prior=kind,
-        adhop=options.adhop,
-        seed=args.seed,
-    )
     encoded = msgspec.json.encode(summary)
     if args.out:
         _write(args.out / "summary.json", encoded + b"\n")

@@ -24,7 +24,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="the daemon: camera to autopilot",
         description="Localizes camera frames and sends vision position estimates to the autopilot until SIGTERM or "
         "SIGINT, or the end of a folder or video. config/example.toml explains every key. SIGHUP reads the file again: "
-        f"{', '.join(RELOADABLE)} take effect at once, other keys are named and need a restart.",
+        f"{', '.join(RELOADABLE)} take effect at once, other keys are named and need a restart."
+        " With [page] enabled it serves a page for the ground crew, at http://127.0.0.1:8080 if nothing else is said "
+        "(docs/page.md).",
     )
     parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="TOML")
     parser.set_defaults(run=run)

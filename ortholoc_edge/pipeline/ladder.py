@@ -33,6 +33,11 @@ class Ladder:
     def rung(self) -> int:
         return self._rung
 
+    @property
+    def rungs(self) -> int:
+        """How many there are."""
+        return self._last + 1
+
     def allow(self, budget_ms: float) -> None:
         """Another budget from now on. One that has none, since a replay must be the same everywhere, gets none."""
         if self._budget_ms is not None:

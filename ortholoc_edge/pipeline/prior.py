@@ -90,6 +90,19 @@ def footprint(camera: Camera, map_from_camera: Rigid3, ground_m: float) -> Float
     u = np.linspace(-0.5, camera.width - 0.5, _SAMPLES_PER_SIDE)
     v = np.linspace(-0.5, camera.height - 0.5, _SAMPLES_PER_SIDE)
     px = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    return _on_the_ground(px, camera, map_from_camera, ground_m)
+
+
+def outline(camera: Camera, map_from_camera: Rigid3, ground_m: float) -> FloatArray:
+    """As `footprint`, of the rim alone, once around: a polygon to draw (K, 2)."""
+    along = np.linspace(0.0, 1.0, _SAMPLES_PER_SIDE)[:-1]
+    zero, one = np.zeros_like(along), np.ones_like(along)
+    sides = [(along, zero), (one, along), (1.0 - along, one), (zero, 1.0 - along)]
+    rim = np.concatenate([np.stack(side, axis=1) for side in sides])
+    return _on_the_ground(rim * (camera.width, camera.height) - 0.5, camera, map_from_camera, ground_m)
+
+
+def _on_the_ground(px: FloatArray, camera: Camera, map_from_camera: Rigid3, ground_m: float) -> FloatArray:
     rays = camera.pinhole().unproject(px) @ map_from_camera.rotation.T
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     drop = float(map_from_camera.translation[2]) - ground_m

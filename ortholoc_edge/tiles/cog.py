@@ -106,6 +106,12 @@ class Cog:
         self._nodata: float | None = None
         self._memory: MemoryFile | None = MemoryFile(data)
 
+    def aside(self, handles: Handles) -> Cog:
+        """The same bytes with other handles, and so another lock. Checked as this one is."""
+        other = Cog(self._data, self.path, handles)
+        other._grids, other._nodata = self._grids, self._nodata
+        return other
+
     def __enter__(self) -> Cog:
         return self
 

@@ -5,6 +5,7 @@ What a missing or damaged tile, or a damaged block of one, would show is a hole:
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import logging
 import stat
@@ -105,6 +106,18 @@ class LoadedLayer:
                 held.cog.close()
             self._held = {}
             self._cache.clear()
+
+    def aside(self) -> LoadedLayer:
+        """The same bytes, not copied, for a reader that must not hold up those of this one: it has a lock, and open
+        datasets, of its own. What it finds damaged it tells nobody. To be closed by itself."""
+        other = copy.copy(self)
+        other._handles, other._cache, other.damaged = Handles(), BlockCache(0), list(self.damaged)
+        with self._handles.lock:
+            other._held = {
+                key: _Held(held.note, held.cog.aside(other._handles), held.damaged, told=True)
+                for key, held in self._held.items()
+            }
+        return other
 
     def read_grey(self, level: int, window: PixelWindow) -> tuple[ImageArray, BoolArray]:
         """Grey (H, W) uint8, black where invalid, and validity (H, W) of a window inside a level of a DOP."""

@@ -101,6 +101,7 @@ class MapStore:
         except BaseException:
             self._dop.close()
             raise
+        self._pictures: LoadedLayer | None = None
         self._features: dict[int, bytes] = {}
         self._damaged_features: list[str] = []
         for tile in feature_tiles:
@@ -126,6 +127,9 @@ class MapStore:
     def close(self) -> None:
         """Free the memory; later reads raise MapError."""
         self._dop.close()
+        with self._handles.lock:
+            if self._pictures is not None:
+                self._pictures.close()
         self._dsm.close()
         self._features = {}
 
@@ -183,7 +187,8 @@ class MapStore:
         return MapWindow(grey, valid, dop_grid, dsm, self._dsm.grids[dsm_level].crop(*dsm_window))
 
     def read_colour(self, bounds_map: Bounds, gsd_m: float) -> ColourWindow | None:
-        """The orthophoto that `read` gives in grey, in colour. For pictures: it decodes anew each time.
+        """The orthophoto that `read` gives in grey, in colour. For pictures: it decodes anew each time, and
+        who localizes meanwhile does not wait for it.
 
         Returns: None where the region holds no pixel of it. Raises: as `read`.
         """
@@ -191,7 +196,10 @@ class MapStore:
         if found is None:
             return None
         level, window, grid = found
-        rgb, valid = self._dop.read_rgb(level, window)
+        with self._handles.lock:
+            if self._pictures is None:
+                self._pictures = self._dop.aside()
+        rgb, valid = self._pictures.read_rgb(level, window)
         for array in (rgb, valid):
             array.flags.writeable = False
         return ColourWindow(rgb, valid, grid)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -402,6 +403,17 @@ def test_replay_json_and_files(flight: Path, tmp_path: Path, capsys: pytest.Capt
     track = cv2.imread(str(out / "track.png"))[..., ::-1]
     assert coloured(track, draw.TRUTH) > 20
     assert coloured(track, draw.ESTIMATE) > 20
+
+    page = (out / "report.html").read_text("utf-8")
+    shown = json.loads(page.split('<script type="application/json" id="data">')[1].split("</script>")[0])
+    assert [frame["name"] for frame in shown["frames"]] == ["frame_00", "frame_01", "frame_02"]
+    west, south, east, north = shown["map"]["bounds"]
+    for frame, record in zip(shown["frames"], records, strict=True):
+        assert frame["error"] == [record["te_m"], record["re_deg"]]
+        assert math.dist(frame["truth"], frame["mark"]["fix"]["at"][:2]) <= record["te_m"] + 0.02
+        assert west < frame["truth"][0] < east and south < frame["truth"][1] < north
+        assert len(frame["picture"]["inliers"]) > 20
+    assert "position error" in page and "http:" not in page and "https:" not in page
 
 
 @pytest.mark.parametrize("kind", list(PriorKind))

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
@@ -34,10 +35,11 @@ from ortholoc_edge.adapters.camera import CameraOptions, EndOfFrames, FrameSourc
 from ortholoc_edge.adapters.flight_log import LogOptions
 from ortholoc_edge.adapters.mavlink import SystemStatus
 from ortholoc_edge.adapters.messages import AutopilotMessage
+from ortholoc_edge.adapters.page.options import PageOptions
 from ortholoc_edge.clock import SystemClock
 from ortholoc_edge.config import Config, MountOptions
 from ortholoc_edge.daemon import Daemon, LatestSlot
-from ortholoc_edge.errors import CameraError, LinkError, MapError, OrtholocError
+from ortholoc_edge.errors import CameraError, ConfigError, LinkError, MapError, OrtholocError
 from ortholoc_edge.geometry import frames, rotation
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.frame import Frame
@@ -155,6 +157,50 @@ def test_video_to_autopilot(video: Path, peer: tuple[HoveringAutopilot, str]) ->
         wait_for(lambda: len(autopilot.messages("VISION_POSITION_ESTIMATE")) >= 3, "three VISION_POSITION_ESTIMATE")
     check_estimates(autopilot, outcomes)
     assert all(frame is not None for frame, _ in outcomes)
+
+
+def test_the_ground_page_shows_the_flight_and_a_taken_port_does_not_end_it(folder: Path) -> None:
+    """The port is taken at first: the flight begins all the same, and the page comes when it is free."""
+    taken = socket.create_server(("127.0.0.1", 0))
+    port = taken.getsockname()[1]
+    wire = UdpWire()
+    autopilot = HoveringAutopilot(wire)
+    page = PageOptions(enabled=True, listen=f"127.0.0.1:{port}")
+    daemon = Daemon(config(f"folder:{folder}", f"udpout:127.0.0.1:{wire.port}", page=page))
+
+    def state() -> dict[str, Any]:
+        try:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/state.json", timeout=5.0) as answer:
+                return dict(msgspec.json.decode(answer.read()))
+        except OSError:
+            return {}
+
+    try:
+        with running(daemon):
+            wait_for(lambda: int(daemon.statistics().get("fixes", 0)) >= 1, "a fix without the page")
+            taken.close()
+            shown = wait_for(
+                lambda: (found := state()) and any("fix" in m for m in found["marks"]) and found["health"] and found,
+                "a fix on the page",
+            )
+            kinds = {mark.get("reason", "fix") for mark in shown["marks"]}
+    finally:
+        taken.close()
+        autopilot.close()
+    assert kinds <= {"fix", "bad_frame", "bad_attitude", "no_prior"}
+    mark = next(mark for mark in reversed(shown["marks"]) if "fix" in mark)
+    at = np.array(mark["fix"]["at"][:2]) + shown["scene"]["origin"]
+    assert np.linalg.norm(at - TRUTH.translation[:2]) < 3.0
+    assert mark["fix"]["heading_deg"] == pytest.approx(YAW - math.degrees(shown["scene"]["convergence_rad"]), abs=2.0)
+    assert shown["health"]["autopilot"]["connected"] and shown["health"]["vehicle"].startswith("ardupilot")
+    assert mark["took_ms"]["total"] > 0 and shown["health"]["statistics"]["page_dropped"] == 0
+    assert state() == {}, "it ended with the daemon"
+
+
+def test_a_page_for_all_without_a_token_is_refused(folder: Path) -> None:
+    page = PageOptions(enabled=True, listen="0.0.0.0:8080")
+    with pytest.raises(ConfigError, match=r"\[page\] listen: 0\.0\.0\.0:8080"):
+        Daemon(config(f"folder:{folder}", "udpout:127.0.0.1:9", page=page))
 
 
 def test_without_an_origin_nothing_is_sent(folder: Path) -> None:

@@ -12,7 +12,6 @@ import hashlib
 import hmac
 import logging
 import os
-import stat
 from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
@@ -21,6 +20,7 @@ import msgspec
 
 from ortholoc_edge.adapters.mavlink.codec import MavlinkMessage, dialect
 from ortholoc_edge.adapters.mavlink.options import LinkOptions
+from ortholoc_edge.adapters.secret import read_secret
 from ortholoc_edge.errors import ConfigError
 
 logger = logging.getLogger(__name__)
@@ -240,29 +240,7 @@ def read_key(name: str, environ: Mapping[str, str]) -> bytes:
         environ: for ``CREDENTIALS_DIRECTORY``.
     Raises: ConfigError that says what is wrong with it, and never what is in it.
     """
-    if "/" in name:
-        path = Path(name)
-    elif "CREDENTIALS_DIRECTORY" in environ:
-        path = Path(environ["CREDENTIALS_DIRECTORY"]) / name
-    else:
-        raise ConfigError(
-            f"[link] signing_key: {name!r} names a systemd credential, but there is no CREDENTIALS_DIRECTORY; write "
-            f"LoadCredential={name}:/path/to/key into the unit, or a path with a slash here"
-        )
-    try:
-        mode, content = path.stat().st_mode, path.read_bytes()
-    except OSError as error:
-        raise ConfigError(
-            f"[link] signing_key: {path} can't be read: {error.strerror}; name a file that the user of this program "
-            "owns, with mode 600, or a systemd credential"
-        ) from error
-    # A credential of systemd's shows the mask of its access list where other files have their group's bits.
-    others = stat.S_IROTH | stat.S_IWOTH | (stat.S_IRGRP | stat.S_IWGRP if "/" in name else 0)
-    if mode & others:
-        raise ConfigError(
-            f"[link] signing_key: others than its owner may read or write {path} (mode {stat.S_IMODE(mode):o}), so it "
-            "is no secret; make a new key, and chmod 600 it"
-        )
+    path, content = read_secret(name, environ, "[link] signing_key")
     key = content
     if len(content) != _KEY_BYTES:
         try:
