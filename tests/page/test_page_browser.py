@@ -12,8 +12,8 @@ import pytest
 from chromium import Chromium, Tab, chromium, find
 from ortholoc_sim import demo_pack_path
 
-from ortholoc_edge.adapters.messages import AutopilotMessage
 from ortholoc_edge.adapters.computer import ComputerStatus
+from ortholoc_edge.adapters.messages import AutopilotMessage
 from ortholoc_edge.adapters.page.ground_page import GroundPage, Health
 from ortholoc_edge.adapters.page.options import Listen
 from ortholoc_edge.adapters.page.report import FlightRecord

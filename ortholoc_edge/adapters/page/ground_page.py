@@ -22,8 +22,8 @@ import numpy as np
 from msgspec import Struct
 
 from ortholoc_edge import __version__
-from ortholoc_edge.adapters.messages import AutopilotMessage
 from ortholoc_edge.adapters.computer import ComputerStatus
+from ortholoc_edge.adapters.messages import AutopilotMessage
 from ortholoc_edge.adapters.page.board import Board
 from ortholoc_edge.adapters.page.http import RefusedError, Request, response
 from ortholoc_edge.adapters.page.marks import Drawing, ground_of
