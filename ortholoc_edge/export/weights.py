@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import pickle
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -41,7 +42,9 @@ def read_weights(path: Path, file: WeightsFile) -> dict[str, torch.Tensor]:
             entries: Any = load_file(path)
         else:
             # Checkpoints of DUSt3R and MASt3R keep the training's arguments, too: a class of plain values.
-            with torch.serialization.safe_globals([argparse.Namespace]):
+            with torch.serialization.safe_globals([argparse.Namespace]), warnings.catch_warnings():
+                # Of a pickle of another kind: whether it can be read shows by itself.
+                warnings.simplefilter("ignore")
                 entries = torch.load(path, map_location="cpu", weights_only=True)
     except OSError as err:
         raise ModelError(f"weights {path} can't be read ({err.strerror or err}); check the path") from err
