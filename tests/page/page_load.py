@@ -198,8 +198,8 @@ def latency(args: argparse.Namespace) -> None:
     idle = rss_mib()
     record = AutopilotMessage(
         stamp_ns=0, unix_ns=0, connected=True, fusion="fused", fusion_since_s=1.0, fusion_reason="", gnss="ok",
-        gnss_since_s=1.0, gnss_apart_m=0.5, gnss_height_apart_m=None, latency_median_ms=80.0, latency_p99_ms=120.0, delay_advice=None,
-        on_vision=False,
+        gnss_since_s=1.0, gnss_apart_m=0.5, gnss_height_apart_m=None, latency_median_ms=80.0, latency_p99_ms=120.0,
+        delay_advice=None, on_vision=False,
     )  # fmt: skip
     computer = ComputerReader().read()
     wall: dict[str, list[float]] = {mode: [] for mode in MODES}
