@@ -694,7 +694,7 @@ class _BrokenMatcher:
         return None
 
     def match(self, query: Any, reference: Any) -> Any:
-        raise AssertionError
+        assert query is None, "only the warm-up comes so far"
 
 
 def test_bug_is_counted_and_then_ends_the_process(tmp_path: Path) -> None:
