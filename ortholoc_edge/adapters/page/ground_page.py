@@ -66,12 +66,13 @@ class Health(Struct, frozen=True, kw_only=True):
     """How the daemon fares, once a second.
 
     Attributes:
-        now_ns: of the daemon's clock. tracker: of `TrackerStatus`. vehicle: who answers on the link; trouble: why
-            nobody does. rungs: how many rungs of detail there are.
+        now_ns: of the daemon's clock. tracker: of `TrackerStatus`. paused: by a command. vehicle: who answers on the
+            link; trouble: why nobody does. rungs: how many rungs of detail there are.
     """
 
     now_ns: int
     tracker: str
+    paused: bool
     autopilot: AutopilotMessage
     vehicle: str | None
     trouble: str | None
