@@ -92,7 +92,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--out",
         type=Path,
         metavar="DIR",
-        help="write frames.jsonl, overlays/*.png, track.png, summary.json and report.html there",
+        help="write frames.jsonl, summary.json and report.html (the flight on the map, in one file) there, and of a "
+        "sequence overlays/*.png and track.png",
     )
     matcher_options.add(parser)
     matcher_options.add_features(parser)
