@@ -21,6 +21,7 @@ from ortholoc_edge.adapters.camera import CameraOptions
 from ortholoc_edge.adapters.flight_log import LogOptions
 from ortholoc_edge.adapters.mavlink import GimbalSelection, LinkOptions
 from ortholoc_edge.adapters.page.options import PageOptions
+from ortholoc_edge.adapters.page.options import refused as page_refused
 from ortholoc_edge.errors import ConfigError
 from ortholoc_edge.geometry import frames, rotation
 from ortholoc_edge.geometry.arrays import FloatArray
@@ -240,7 +241,7 @@ def without_secrets(config: Config) -> dict[str, Any]:
 
 
 # In tables of any depth.
-_SECRET_KEYS = frozenset({"signing_key", "signing_state", "private_key"})
+_SECRET_KEYS = frozenset({"signing_key", "signing_state", "private_key", "token_file"})
 _LEFT_OUT = "(left out)"
 # rtsp://NAME:PASSWORD@HOST, and properties of GStreamer's sources.
 _IN_ADDRESS = re.compile(r"(://)[^/@\s]+@")
@@ -306,6 +307,8 @@ def _not_finite(value: Any, key: str) -> Iterator[str]:
 def _contradictions(config: Config) -> Iterator[str]:
     if not config.link.send:
         yield "`$.link.send` is empty, so no fix would reach the autopilot; write [\"auto\"]"
+    if config.page.enabled and (why := page_refused(config.page)) is not None:
+        yield f"`$.page.listen`: {why}"
     for side in ("width_px", "height_px"):
         asked, calibrated = getattr(config.camera, side), getattr(config.intrinsics, side)
         if asked is not None and asked != calibrated:

@@ -23,6 +23,7 @@ from ortholoc_edge.adapters.computer import ComputerReader, ComputerStatus
 from ortholoc_edge.adapters.mavlink.audit import Finding, Level
 from ortholoc_edge.adapters.mavlink.options import parse_endpoint
 from ortholoc_edge.adapters.mavlink.signing import read_key
+from ortholoc_edge.adapters.page.options import read_token
 from ortholoc_edge.clock import Clock, wall_clock_ns
 from ortholoc_edge.config import Config
 from ortholoc_edge.daemon import require_flyable
@@ -155,22 +156,30 @@ def _group(path: Path) -> str:
 
 def check_keys(config: Config, environ: Mapping[str, str]) -> list[Finding]:
     """Keys that are configured can be read; never what is in them."""
-    key = config.link.signing_key
-    if key is None:
-        return []
-    if "/" not in key and "CREDENTIALS_DIRECTORY" not in environ:
-        return [
-            Finding(
-                Level.NOTE, "signing key", f"{key!r} is a systemd credential", "readable",
-                "only the service is handed it, so it can't be looked at here",
-                f"see that the unit has LoadCredential={key}:/path/to/key",
+    asked: list[tuple[str, str | None, Callable[[str, Mapping[str, str]], bytes]]] = [
+        ("signing key", config.link.signing_key, read_key),
+        ("token of the page", config.page.token_file if config.page.enabled else None, read_token),
+    ]
+    findings = []
+    for subject, name, read in asked:
+        if name is None:
+            continue
+        if "/" not in name and "CREDENTIALS_DIRECTORY" not in environ:
+            findings.append(
+                Finding(
+                    Level.NOTE, subject, f"{name!r} is a systemd credential", "readable",
+                    "only the service is handed it, so it can't be looked at here",
+                    f"see that the unit has LoadCredential={name}:/path/to/key",
+                )
+            )  # fmt: skip
+            continue
+        try:
+            read(name, environ)
+        except ConfigError as error:
+            findings.append(
+                _error(subject, error, "one that nobody else can read", "without it the daemon does not start")
             )
-        ]  # fmt: skip
-    try:
-        read_key(key, environ)
-    except ConfigError as error:
-        return [_error("signing key", error, "a key that nobody else can read", "without it the daemon does not start")]
-    return []
+    return findings
 
 
 # -- map and model -------------------------------------------------------------------------------------

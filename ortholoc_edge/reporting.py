@@ -185,6 +185,7 @@ class Reporter:
         return Health(
             now_ns=now_ns,
             tracker=self._status(now_ns).value,
+            paused=self._commander.paused,
             autopilot=autopilot_message(now_ns, unix_ns, self._link, witness, self._sources.on_vision),
             vehicle=None if vehicle is None else f"{vehicle.autopilot.value} {vehicle.firmware}",
             trouble=self._link.trouble(),

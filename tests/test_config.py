@@ -32,6 +32,11 @@ def write(folder: Path, *changes: tuple[str, str]) -> Path:
 @pytest.mark.parametrize(
     ("old", "new", "named"),
     [
+        (
+            'enabled = false             # true: serve it\nlisten = "127.0.0.1:8080"',
+            'enabled = true\nlisten = "0.0.0.0:8080"',
+            r"\$\.page\.listen`: 0\.0\.0\.0:8080 can be reached from other computers",
+        ),
         # Not finite.
         ("latency_ms = 45.0", "latency_ms = nan", r"camera\.latency_ms"),
         ("\nrate_hz = 10.0 ", "\nrate_hz = nan ", r"camera\.rate_hz"),

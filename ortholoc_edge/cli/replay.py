@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from itertools import chain
@@ -15,10 +14,10 @@ from tqdm import tqdm
 
 from ortholoc_edge import __version__
 from ortholoc_edge.adapters.flight_log import libraries
-from ortholoc_edge.adapters.page.report import MOST_PICTURES, FlightRecord
+from ortholoc_edge.adapters.page.report import FlightRecord
 from ortholoc_edge.bench import report, sequence
 from ortholoc_edge.bench.draw import write_png
-from ortholoc_edge.bench.flight_log import compare, log_files, read_frames, read_header, repeat
+from ortholoc_edge.bench.flight_log import LoggedFrame, compare, log_files, read_frames, read_header, repeat
 from ortholoc_edge.bench.replay import FrameResult, Length, PriorKind, PriorNoise
 from ortholoc_edge.bench.runner import SAMPLES_PACK, prior_used, run_flight, run_samples, summarise
 from ortholoc_edge.bench.samples import sample_paths
@@ -27,7 +26,10 @@ from ortholoc_edge.cli.arguments import length, non_negative, seed, sigma_triple
 from ortholoc_edge.config import config_from_text
 from ortholoc_edge.daemon import configured_matcher, make_navigator
 from ortholoc_edge.errors import ConfigError, DatasetError, OrtholocError
+from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
+from ortholoc_edge.pipeline.outcome import Fix
+from ortholoc_edge.pipeline.record import outcome_of
 from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.store import MapStore
 
@@ -90,7 +92,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--out",
         type=Path,
         metavar="DIR",
-        help="write frames.jsonl, overlays/*.png, track.png, summary.json and report.html there",
+        help="write frames.jsonl, summary.json and report.html (the flight on the map, in one file) there, and of a "
+        "sequence overlays/*.png and track.png",
     )
     matcher_options.add(parser)
     matcher_options.add_features(parser)
@@ -129,13 +132,23 @@ def _fly_again(logs: list[Path], args: argparse.Namespace) -> int:
                 "in the configuration, or build it with the version that flew"
             )
         navigator = make_navigator(config, store, matcher, 0, None)
+        camera = config.intrinsics.camera()
+        fixed = config.mount.body_from_camera() if config.mount.gimbal_selection() is None else None
+        record = FlightRecord.over(store, camera, fixed) if args.out else None
         try:
-            steps = chain.from_iterable(map(read_frames, logs))
+            steps: Iterable[LoggedFrame] = chain.from_iterable(map(read_frames, logs))
+            if record is not None:
+                steps = _recorded(steps, record, store, camera)
             found = list(tqdm(repeat(steps, navigator), desc=args.sequence.name, unit="frame"))
         finally:
             navigator.localizer.close()
-    others = {name: was for name, was in header.libraries.items() if libraries().get(name) != was}
-    comparison = compare(logs, header.version, others, found)
+        others = {name: was for name, was in header.libraries.items() if libraries().get(name) != was}
+        comparison = compare(logs, header.version, others, found)
+        page = None
+        if record is not None:
+            notes = [f"{args.sequence.name}, flown by ortholoc-edge {header.version}: the outcomes of the flight"]
+            table = report.comparison_table(comparison)
+            page = record.page(store, f"Flight log {args.sequence.name}", notes, table)
     if not comparison.pictures:
         raise DatasetError(
             f"{args.sequence}: {len(found)} frames, none with a picture without loss; such logs are written with "
@@ -146,8 +159,22 @@ def _fly_again(logs: list[Path], args: argparse.Namespace) -> int:
         taken = [one for one in found if one is not None]
         _write(args.out / "frames.jsonl", b"".join(msgspec.json.encode(one) + b"\n" for one in taken))
         _write(args.out / "summary.json", encoded + b"\n")
+        if page is not None:
+            _write(args.out / "report.html", page.encode())
     print(encoded.decode() if args.json else report.comparison_table(comparison))
     return 0 if comparison.same == comparison.repeated else 1
+
+
+def _recorded(
+    steps: Iterable[LoggedFrame], record: FlightRecord, store: MapStore, camera: Camera
+) -> Iterator[LoggedFrame]:
+    """The steps as they come, noted down for the report."""
+    for one in steps:
+        outcome, state = outcome_of(one.record.outcome, camera), one.record.state()
+        ground_m = store.ground_near(outcome.map_from_camera.translation[:2]) if isinstance(outcome, Fix) else None
+        prior = one.record.circumstances().prior
+        record.add(one.record.name, outcome, prior=prior, image=one.image, state=state, ground_m=ground_m)
+        yield one
 
 
 def _replay(args: argparse.Namespace) -> int:
@@ -172,15 +199,14 @@ def _replay(args: argparse.Namespace) -> int:
     record: FlightRecord | None = None
 
     def collect(found: Iterable[FrameResult], total: int) -> None:
-        for number, result in enumerate(tqdm(found, total=total, desc=args.sequence.name, unit="frame")):
+        for result in tqdm(found, total=total, desc=args.sequence.name, unit="frame"):
             if writer is not None:
                 writer.write(result)
             if record is not None:
-                is_kept = number % math.ceil(total / MOST_PICTURES) == 0
+                error = None if result.error is None else (result.error.te_m, result.error.re_deg)
                 record.add(
-                    result.name, result.outcome, prior=result.prior, truth=result.truth,
-                    error=None if result.error is None else (result.error.te_m, result.error.re_deg),
-                    image=result.image if is_kept else None,
+                    result.name, result.outcome, prior=result.prior, image=result.image, truth=result.truth,
+                    error=error,
                 )  # fmt: skip
             # The picture is written; a long sequence must not pile up in memory.
             results.append(replace(result, image=None))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,10 +11,11 @@ from msgspec import Struct
 
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import FloatArray
+from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.frame import CameraMount, VehicleState
 from ortholoc_edge.pipeline.navigator import Circumstances, Tuning
-from ortholoc_edge.pipeline.outcome import Fix, Outcome
+from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.prior import PosePrior
 from ortholoc_edge.pipeline.tracker import Order
 
@@ -47,6 +50,37 @@ def outcome_record(outcome: Outcome) -> dict[str, Any]:
         "focal_sigma_px": outcome.focal_sigma_px,
         "timings_ms": outcome.timings_ms,
     }
+
+
+def outcome_of(record: Mapping[str, Any], camera: Camera) -> Outcome:
+    """The outcome of an `outcome_record`, but for the inliers themselves, which it has not.
+
+    Args:
+        camera: of the flight; a calibrated focal length is taken from the record.
+    """
+    if not record["fix"]:
+        return Rejected(
+            record["stamp_ns"], Reason(record["reason"]), record["detail"], record["measured"], record["limit"],
+            record["timings_ms"],
+        )  # fmt: skip
+    turn = rotation.from_quaternion(record["quaternion_map_from_camera_wxyz"])
+    scale = record["focal_px"] / camera.focal_px
+    return Fix(
+        stamp_ns=record["stamp_ns"],
+        map_from_camera=Rigid3(turn, _floats(record["position_map_m"])),
+        camera=replace(camera, fx=camera.fx * scale, fy=camera.fy * scale),
+        covariance=_floats(record["covariance"]),
+        quality=record["quality"],
+        matches=record["matches"],
+        inliers=record["inliers"],
+        rms_px=record["rms_px"],
+        adhop_accepted=record["adhop_accepted"],
+        query_px=np.empty((0, 2)),
+        points_map=np.empty((0, 3)),
+        focal_sigma_px=record["focal_sigma_px"],
+        timings_ms=record["timings_ms"],
+        stored_features=record["stored_features"],
+    )
 
 
 class FrameRecord(Struct, frozen=True, kw_only=True):

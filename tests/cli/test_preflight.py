@@ -101,6 +101,11 @@ def test_keys(good: Config, tmp_path: Path) -> None:
     assert found.level is Level.ERROR and "chmod 600" in found.remedy
     key.chmod(0o600)
     assert preflight.check_keys(with_(good, link={"signing_key": str(key)}), {}) == []
+    page = {"enabled": True, "listen": "0.0.0.0:8080", "token_file": str(key)}
+    found = only(preflight.check_keys(with_(good, page=page), {}))
+    assert found.subject == "token of the page" and "16 to 256" in found.remedy
+    key.write_text("0123456789abcdef")
+    assert preflight.check_keys(with_(good, page=page), {}) == []
 
 
 def test_the_pack_and_the_memory_for_it(good: Config, tmp_path: Path) -> None:

@@ -425,10 +425,18 @@ def replayed(source: Path, capsys: pytest.CaptureFixture[str], *more: str) -> tu
     return code, json.loads(capsys.readouterr().out)
 
 
-def test_a_flight_comes_out_the_same_in_every_bit(flown_log: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, found = replayed(flown_log, capsys)
+def test_a_flight_comes_out_the_same_in_every_bit(
+    flown_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    code, found = replayed(flown_log, capsys, "--out", str(out))
     assert code == 0
     assert found["steps"] == found["repeated"] == found["same"] >= 5
+    page = (out / "report.html").read_text(encoding="utf-8")
+    shown = json.loads(page.split('<script type="application/json" id="data">')[1].split("</script>")[0])["frames"]
+    assert len(shown) == found["steps"]
+    assert sum("fix" in frame["mark"] for frame in shown) == found["fixes"]
+    assert any(frame["picture"] for frame in shown) and any("believed" in frame["mark"] for frame in shown)
     assert found["other_libraries"] == {}
     assert 1 <= found["fixes"] < found["steps"], "fixes and refusals"
     assert (found["alone"], found["left_out"], found["furthest_m"]) == (0, 0, 0.0)

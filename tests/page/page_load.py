@@ -231,8 +231,8 @@ def latency(args: argparse.Namespace) -> None:
                     if k % round(args.rate) == 0:
                         page.tell(
                             Health(
-                                now_ns=stamp_ns, tracker="track", autopilot=record, vehicle="x", trouble=None,
-                                computer=computer, rung=0, rungs=3, statistics={"sent": 1},
+                                now_ns=stamp_ns, tracker="track", paused=False, autopilot=record, vehicle="x",
+                                trouble=None, computer=computer, rung=0, rungs=3, statistics={"sent": 1},
                             )
                         )  # fmt: skip
                 wall[mode].append(1e3 * (time.perf_counter() - began))

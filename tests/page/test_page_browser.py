@@ -75,7 +75,9 @@ class Feeder:
     def reject(self, east_m: float, north_m: float, detail: str = "") -> None:
         self.put(Rejected(0, Reason.LOW_CONTRAST, detail, 4.5, 10.5), self.pose(east_m, north_m))
 
-    def health(self, *, connected: bool = True, fusion: str = "fused", trouble: str | None = None) -> None:
+    def health(
+        self, *, connected: bool = True, fusion: str = "fused", trouble: str | None = None, paused: bool = False
+    ) -> None:
         now_ns = self.clock.now_ns()
         record = AutopilotMessage(
             stamp_ns=now_ns, unix_ns=0, connected=connected, fusion=fusion, fusion_since_s=1.0, fusion_reason="because",
@@ -86,8 +88,8 @@ class Feeder:
         statistics = {"sent": 5, "fixes": 5, "rejected": 1, "map_files_damaged": 0}
         self.page.tell(
             Health(
-                now_ns=now_ns, tracker="track", autopilot=record, vehicle="ardupilot 4.6.1", trouble=trouble,
-                computer=computer, rung=1, rungs=3, statistics=statistics,
+                now_ns=now_ns, tracker="track", paused=paused, autopilot=record, vehicle="ardupilot 4.6.1",
+                trouble=trouble, computer=computer, rung=1, rungs=3, statistics=statistics,
             )
         )  # fmt: skip
 
@@ -261,6 +263,7 @@ def test_what_is_old_is_never_shown_as_fresh(browser: Chromium, flying: Feeder) 
     assert "fix, 0." in tab.text("#state"), "the camera still finds it"
     until("document.getElementById('state-word').innerText === 'NO FRAMES'", "no frames", flying.health)
     assert tab.run("map.layers.prior") is None, "a prediction of long ago"
+    until("document.getElementById('state-word').innerText === 'PAUSED'", "paused", lambda: flying.health(paused=True))
     until("document.getElementById('state-word').innerText === 'STANDS STILL'", "standing still", lambda: None)
     flying.page.close()
     until("document.getElementById('state-word').innerText === 'NO CONTACT'", "no contact", lambda: None)

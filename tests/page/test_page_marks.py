@@ -54,7 +54,8 @@ DRAWING = Drawing(ORIGIN, CAMERA, NADIR)
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 90.0, 215.0])
 def test_a_fix_is_drawn_where_it_is_and_as_it_heads(yaw_deg: float) -> None:
-    mark = DRAWING.mark(7, a_fix(down(yaw_deg)), None, late_ms=40.06)
+    fix = a_fix(down(yaw_deg))
+    mark = DRAWING.mark(7, fix, ground_of(fix), late_ms=40.06)
     assert mark.fix is not None
     assert mark.fix.at == (20.0, 30.0, 100.0)
     assert mark.fix.heading_deg == pytest.approx(yaw_deg, abs=0.1)

@@ -352,6 +352,25 @@ def test_a_flood_leaves_the_interpreter_to_others(open_page: Running) -> None:
     assert 0 < rounds <= spent_s / server_module._REST_S
 
 
+def test_clients_that_came_and_went_leave_nothing_open() -> None:
+    with serving() as running:
+        taken: list[socket.socket] = []
+        accept = running.server._take
+
+        def noted() -> None:
+            accept()
+            taken.extend(sock for sock in running.server._clients if sock not in taken)
+
+        running.server._take = noted  # type: ignore[method-assign]
+        for sent in (get(), get("/nowhere"), b"garbage\r\n\r\n", get("/events"), b"GET"):
+            for _ in range(8):
+                with connect(running) as sock:
+                    sock.sendall(sent)
+        wait_for(lambda: running.server.clients == 0, "all gone")
+        assert len(taken) >= 20 and all(sock.fileno() < 0 for sock in taken)
+        assert len(running.server._selector.get_map()) == 1, "the listener alone"
+
+
 # -- events --------------------------------------------------------------------------------------------
 
 

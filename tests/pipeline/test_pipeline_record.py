@@ -9,7 +9,7 @@ from scenes_pipeline import fix, turned_down
 
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.pipeline.outcome import Reason, Rejected
-from ortholoc_edge.pipeline.record import outcome_record
+from ortholoc_edge.pipeline.record import outcome_of, outcome_record
 from ortholoc_edge.pipeline.trace import Trace
 
 
@@ -34,6 +34,20 @@ def test_a_fix_survives_json():
     assert record["adhop_accepted"] is None
     assert record["focal_px"] == pytest.approx(200.0)
     assert record["focal_sigma_px"] is None
+
+
+def test_a_record_becomes_an_outcome_again():
+    """All but the inliers, which it has not."""
+    made = fix((500_000.125, 5_300_000.5, 321.0), stamp_ns=7, rotation_matrix=turned_down(12.0, 77.0))
+    record = both_ways(outcome_record(made))
+    again = outcome_record(outcome_of(record, made.camera))
+    turns = [one.pop("quaternion_map_from_camera_wxyz") for one in (record, again)]
+    assert turns[1] == pytest.approx(turns[0]) and again == record
+    record["quaternion_map_from_camera_wxyz"] = turns[0]
+    calibrated = outcome_of({**record, "focal_px": 2 * made.camera.focal_px, "focal_sigma_px": 3.0}, made.camera)
+    assert calibrated.camera.fx == pytest.approx(2 * made.camera.fx)
+    refused = both_ways(outcome_record(Rejected(123, Reason.UNCERTAIN, "why", 1.5, 2, {"total": 7.25})))
+    assert outcome_record(outcome_of(refused, made.camera)) == refused
 
 
 @pytest.mark.parametrize("reason", list(Reason))

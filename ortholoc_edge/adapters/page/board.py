@@ -21,7 +21,6 @@ Place = tuple[float, float, int, int]
 class Board:
     """
     Attributes:
-        ground_m: under the last fix; None before the first.
         last: number of the last mark, -1 before the first.
     """
 
@@ -29,7 +28,6 @@ class Board:
         self._marks: deque[Mark] = deque(maxlen=_MARKS)
         self._track: list[Place] = []
         self._every = 1
-        self.ground_m: float | None = None
         self.last = -1
 
     def add(self, mark: Mark) -> None:

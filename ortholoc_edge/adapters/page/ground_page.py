@@ -66,12 +66,13 @@ class Health(Struct, frozen=True, kw_only=True):
     """How the daemon fares, once a second.
 
     Attributes:
-        now_ns: of the daemon's clock. tracker: of `TrackerStatus`. vehicle: who answers on the link; trouble: why
-            nobody does. rungs: how many rungs of detail there are.
+        now_ns: of the daemon's clock. tracker: of `TrackerStatus`. paused: by a command. vehicle: who answers on the
+            link; trouble: why nobody does. rungs: how many rungs of detail there are.
     """
 
     now_ns: int
     tracker: str
+    paused: bool
     autopilot: AutopilotMessage
     vehicle: str | None
     trouble: str | None
@@ -153,6 +154,7 @@ class GroundPage:
         self.dropped = 0
         # From here on the thread's own.
         self._board = Board()
+        self._last_fix: Fix | None = None
         self._numbers = 0
         self._pictures: deque[_Picture] = deque(maxlen=2)
         self._drawn_of = -1
@@ -224,7 +226,7 @@ class GroundPage:
             if now_s - looked_s < _TELL_S:
                 continue
             looked_s = now_s
-            is_new = self._take()
+            is_new = self._take(server.viewers > 0)
             if not server.viewers:
                 continue
             if now_s - drawn_s >= _PICTURE_S and self._draw():
@@ -234,19 +236,22 @@ class GroundPage:
                 server.tell(self._event)
                 self._told = self._health, self._pictures[-1] if self._pictures else None
 
-    def _take(self) -> bool:
-        """Whether the frame path left anything."""
+    def _take(self, watched: bool) -> bool:
+        """Whether the frame path left anything. Only where somebody watches the newest gets what the camera sees."""
         is_new = bool(self._inbox)
         while self._inbox:
             left = self._inbox.popleft()
             outcome, was = left.outcome, left.circumstances
-            ground_m = ground_of(outcome) if isinstance(outcome, Fix) else None
-            if ground_m is not None:
-                self._board.ground_m = ground_m
+            if isinstance(outcome, Fix):
+                self._last_fix = outcome
+            ground_m = None
+            if watched and not self._inbox and self._last_fix is not None:
+                ground_m = ground_of(self._last_fix)
             self._board.add(
                 self._drawing.mark(
-                    self._numbers, outcome, self._board.ground_m, prior=None if was is None else was.prior,
-                    state=left.state, late_ms=(left.now_ns - outcome.stamp_ns) / _MS,
+                    self._numbers, outcome, ground_m,
+                    prior=None if was is None else was.prior, state=left.state,
+                    late_ms=(left.now_ns - outcome.stamp_ns) / _MS,
                 )
             )  # fmt: skip
             self._numbers += 1

@@ -90,7 +90,8 @@ class Drawing:
     ) -> Mark:  # fmt: skip
         """
         Args:
-            ground_m: height of the ground, where a fix has no points to tell it, and for the prediction.
+            ground_m: height of the ground that the camera looks at; None: what it sees is left out, which is most of
+                the work.
         """
         mount = self.body_from_camera if state is None or state.mount is None else state.mount.body_from_camera
         predicted = None
@@ -107,10 +108,7 @@ class Drawing:
                 reason=str(outcome.reason), detail=outcome.detail, measured=outcome.measured, limit=outcome.limit,
                 took_ms=took,
             )  # fmt: skip
-        seen = ground_of(outcome)
-        pose = self._pose(
-            outcome.map_from_camera, outcome.covariance, outcome.camera, mount, ground_m if seen is None else seen
-        )
+        pose = self._pose(outcome.map_from_camera, outcome.covariance, outcome.camera, mount, ground_m)
         return Mark(
             n=n, t=stamp_ms, late_ms=late_ms, fix=pose, prior=predicted, believed=believed, gnss=gnss,
             inliers=outcome.inliers, matches=outcome.matches, quality=round(outcome.quality, 3),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from ipaddress import ip_address
+from ipaddress import IPv4Address, IPv6Address, ip_address
 from typing import Annotated
 
 from msgspec import Meta, Struct
@@ -56,6 +56,19 @@ class Listen:
         return f"http://[{self.address}]:{self.port}" if self.is_ipv6 else f"http://{self.address}:{self.port}"
 
 
+def refused(options: PageOptions) -> str | None:
+    """Why the page can't be served so; None if it can."""
+    place = _address(options.listen)
+    if place is None:
+        return f"{options.listen!r} is no IP address with a port; write 127.0.0.1:8080 or [::1]:8080"
+    if not place[0].is_loopback and options.token_file is None:
+        return (
+            f"{options.listen} can be reached from other computers, and there is no token_file, so anyone there could "
+            "watch the flight; write 127.0.0.1, or name a file with a token"
+        )
+    return None
+
+
 def checked(options: PageOptions, environ: Mapping[str, str]) -> Listen:
     """What the options come to.
 
@@ -63,30 +76,29 @@ def checked(options: PageOptions, environ: Mapping[str, str]) -> Listen:
         environ: for ``CREDENTIALS_DIRECTORY``.
     Raises: ConfigError for an address that is none, one beyond loopback without a token, or a token that is none.
     """
-    host, colon, port = options.listen.rpartition(":")
+    why, place = refused(options), _address(options.listen)
+    if why is not None or place is None:
+        raise ConfigError(f"[page] listen: {why}")
+    token = None if options.token_file is None else read_token(options.token_file, environ)
+    address, port = place
+    hosts = frozenset(name.lower() for name in options.hosts)
+    return Listen(str(address), port, address.version == 6, token, hosts)
+
+
+def _address(listen: str) -> tuple[IPv4Address | IPv6Address, int] | None:
+    host, colon, port = listen.rpartition(":")
     bracketed = host.startswith("[") and host.endswith("]")
     try:
         address = ip_address(host[1:-1] if bracketed else host)
-        if not colon or bracketed != (address.version == 6) or not re.fullmatch(r"\d{1,5}", port, re.ASCII):
-            raise ValueError
-        number = int(port)
-        if number > _MAX_PORT:
-            raise ValueError
     except ValueError:
-        raise ConfigError(
-            f"[page] listen: {options.listen!r} is no IP address with a port; write 127.0.0.1:8080 or [::1]:8080"
-        ) from None
-    token = None if options.token_file is None else _token(options.token_file, environ)
-    if token is None and not address.is_loopback:
-        raise ConfigError(
-            f"[page] listen: {options.listen} can be reached from other computers, and there is no token_file, so "
-            "anyone there could watch the flight; write 127.0.0.1, or name a file with a token"
-        )
-    hosts = frozenset(name.lower() for name in options.hosts)
-    return Listen(str(address), number, address.version == 6, token, hosts)
+        return None
+    if not colon or bracketed != (address.version == 6) or not re.fullmatch(r"\d{1,5}", port, re.ASCII):
+        return None
+    return (address, int(port)) if int(port) <= _MAX_PORT else None
 
 
-def _token(name: str, environ: Mapping[str, str]) -> bytes:
+def read_token(name: str, environ: Mapping[str, str]) -> bytes:
+    """See `PageOptions.token_file`. Raises: ConfigError, as `read_secret`, or for what is no token."""
     path, content = read_secret(name, environ, "[page] token_file")
     token = content.strip()
     if not _TOKEN.fullmatch(token):

@@ -20,6 +20,7 @@ from ortholoc_edge.errors import MapError
 from ortholoc_edge.geometry.arrays import ImageArray
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.rigid import Rigid3
+from ortholoc_edge.pipeline.frame import VehicleState
 from ortholoc_edge.pipeline.outcome import Fix, Outcome
 from ortholoc_edge.pipeline.prior import PosePrior
 from ortholoc_edge.tiles.store import MapStore
@@ -86,6 +87,8 @@ class FlightRecord:
 
     drawing: Drawing
     frames: list[ShownFrame]
+    # Of frames whose picture is kept: every second, fourth and so on as the flight grows.
+    every: int = 1
     ground_m: float | None = None
 
     @classmethod
@@ -96,24 +99,31 @@ class FlightRecord:
         return cls(Drawing(origin, camera, body_from_camera), [])
 
     def add(
-        self, name: str, outcome: Outcome, *, prior: PosePrior | None, truth: Rigid3 | None,
-        error: tuple[float, float] | None, image: ImageArray | None,
+        self, name: str, outcome: Outcome, *, prior: PosePrior | None, image: ImageArray | None,
+        truth: Rigid3 | None = None, error: tuple[float, float] | None = None, state: VehicleState | None = None,
+        ground_m: float | None = None,
     ) -> None:  # fmt: skip
         """
         Args:
-            image: only of frames whose picture is to be kept, `MOST_PICTURES` in all.
+            image: of all frames, of which some are kept.
+            ground_m: height of the ground, of fixes whose points are not known.
         """
         if isinstance(outcome, Fix):
-            ground_m = ground_of(outcome)
-            self.ground_m = self.ground_m if ground_m is None else ground_m
-        mark = self.drawing.mark(len(self.frames), outcome, self.ground_m, prior=prior)
+            seen = ground_of(outcome)
+            self.ground_m = ground_m if seen is None else seen
+        mark = self.drawing.mark(len(self.frames), outcome, self.ground_m, prior=prior, state=state)
         at = None
         if truth is not None:
             east, north = (truth.translation[:2] - self.drawing.origin).tolist()
             at = round(east, 2), round(north, 2)
-        self.frames.append(
-            ShownFrame(name=name, mark=mark, truth=at, error=error, picture=self._picture(image, outcome))
-        )
+        picture = None if len(self.frames) % self.every else self._picture(image, outcome)
+        self.frames.append(ShownFrame(name=name, mark=mark, truth=at, error=error, picture=picture))
+        if len(self.frames) > MOST_PICTURES * self.every:
+            self.every *= 2
+            self.frames = [
+                frame if k % self.every == 0 or frame.picture is None else msgspec.structs.replace(frame, picture=None)
+                for k, frame in enumerate(self.frames)
+            ]
 
     def _picture(self, image: ImageArray | None, outcome: Outcome) -> Picture | None:
         small = None if image is None else thumbnail(image)

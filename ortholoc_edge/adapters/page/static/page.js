@@ -125,6 +125,7 @@ function verdict() {
   if (!health) return dead("STARTING", "the daemon is up, no frame was taken yet", "warn");
   const still = age(health.now_ns / 1e6);
   if (still > STILL_MS) return dead("STANDS STILL", `the daemon's frame path does nothing for ${words(still)}`);
+  if (health.paused) return dead("PAUSED", "by a command: no frame is looked at", "warn");
   const last = marks[marks.length - 1];
   if (!last) return dead("NO FRAMES", "the camera gave no frame yet");
   if (age(last.t) > NO_FRAMES_MS + (last.late_ms || 0)) {

@@ -26,7 +26,8 @@ function start() {
   const hasTruth = report.frames.some((frame) => frame.truth);
   const truth = [(ghost, pen) => ghost.paintLine(pen, [[-12, 0], [12, 0]], INK.truth), "truth"];
   fillLegend(node("legend"), [...(hasTruth ? [truth] : []),
-    ...LEGEND.filter(([, what]) => !what.startsWith("autopilot") && what !== "GNSS")]);
+    ...LEGEND.filter(([, what]) => report.frames.some(({ mark }) => what === "GNSS" ? mark.gnss
+      : what === "autopilot believes" ? mark.believed : true))]);
   const slider = node("slider");
   slider.max = report.frames.length - 1;
   slider.oninput = () => choose(Number(slider.value));
@@ -52,7 +53,7 @@ function choose(number) {
   chosen = Math.min(Math.max(number, 0), report.frames.length - 1);
   const frame = report.frames[chosen], { mark } = frame;
   node("slider").value = chosen;
-  map.show({ pose: mark.fix || null, prior: mark.prior || null,
+  map.show({ pose: mark.fix || null, prior: mark.prior || null, believed: mark.believed || null, gnss: mark.gnss || null,
     points: frame.picture ? frame.picture.inliers.map((row) => [row[4], row[5]]) : [] });
   node("name").textContent = `${chosen + 1} of ${report.frames.length}: ${frame.name}`;
   const lines = mark.fix
