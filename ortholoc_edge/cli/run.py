@@ -35,7 +35,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     # systemd's watchdog ends a process that hangs by SIGABRT: where each thread was is then in the journal.
-    faulthandler.enable(sys.__stderr__)
+    if sys.__stderr__ is not None:
+        faulthandler.enable(sys.__stderr__)
 
     def set_level(config: Config) -> None:
         logging.getLogger().setLevel(logging.DEBUG if args.verbose else config.log.level.upper())
