@@ -189,11 +189,17 @@ def _write_snapshot(folder: Path, image: ImageArray, content: bytes) -> CommandR
 
 def _written(path: Path, data: bytes) -> None:
     part = path.with_name(f".{path.name}.part")
-    with part.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    part.rename(path)
+    try:
+        with part.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        part.rename(path)
+    except OSError:
+        # Of a disk that it filled.
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise
 
 
 def _refused(command: str, reason: str, remedy: str) -> CommandReply:

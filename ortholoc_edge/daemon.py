@@ -224,12 +224,11 @@ class Daemon:
         try:
             return self._desk.ask(lambda: self._carry_out(command), _COMMAND_WAIT_S)
         except BusyError as error:
-            return CommandReply(
-                command=NAME_OF_COMMAND[type(command)],
-                accepted=False,
-                reason=f"the frame path is busy: {error}",
-                remedy="ask again",
-            )
+            why, remedy = f"the frame path is busy: {error}", "ask again"
+        except Exception as error:  # whoever asked is told; the flight goes on
+            logger.exception("command %s", NAME_OF_COMMAND[type(command)])
+            why, remedy = f"it failed ({error!r})", "see the daemon's messages"
+        return CommandReply(command=NAME_OF_COMMAND[type(command)], accepted=False, reason=why, remedy=remedy)
 
     def _carry_out(self, command: Command) -> Answer:
         answer = self._commander.carry_out(command)
@@ -244,9 +243,8 @@ class Daemon:
         self._desk.ask(lambda: self._take_over(plan), _COMMAND_WAIT_S)
 
     def _take_over(self, plan: Plan) -> None:
-        before, self._config = self._config, plan.config
         tuning = tuning_of(plan.config)
-        if tuning != tuning_of(before):
+        if tuning != tuning_of(self._config):
             self._navigator.retune(tuning)
         self._navigator.ladder.allow(plan.config.timing.budget_ms)
         self._vehicle.retune(plan.config.attitude)
@@ -255,6 +253,8 @@ class Daemon:
             self._log.limit(plan.config.log.max_mb)
         if self._bus is not None:
             self._bus.retune(plan.config.bus)
+        # Last: until then what is in force is what it was.
+        self._config = plan.config
         self._counts["reloads"] += 1
         self._reporter.remark = f"restart needed for {', '.join(plan.refused)}" if plan.refused else ""
 
@@ -384,19 +384,19 @@ class Daemon:
                 if ended:
                     return
                 continue
-            if isinstance(item, _Missed):
-                self._reporter.publish(None, Rejected(item.stamp_ns, Reason.BAD_FRAME, item.why))
-                continue
-            if self._commander.paused:
-                self._reporter.publish(item, Rejected(item.stamp_ns, Reason.PAUSED, "by command; send resume"))
-                continue
             try:
-                self._handle(item, stop)
+                if isinstance(item, _Missed):
+                    self._reporter.publish(None, Rejected(item.stamp_ns, Reason.BAD_FRAME, item.why))
+                elif self._commander.paused:
+                    self._reporter.publish(item, Rejected(item.stamp_ns, Reason.PAUSED, "by command; send resume"))
+                else:
+                    self._handle(item, stop)
                 errors = 0
             except Exception as error:  # one spot per thread, around one item (house style)
                 errors += 1
                 logger.exception("frame at %d ns", item.stamp_ns)
-                self._reporter.publish(item, Rejected(item.stamp_ns, Reason.INTERNAL, repr(error)))
+                frame = None if isinstance(item, _Missed) else item
+                self._reporter.publish(frame, Rejected(item.stamp_ns, Reason.INTERNAL, repr(error)))
                 if errors >= _MAX_ERRORS_IN_A_ROW:
                     raise OrtholocError(f"{errors} frames in a row failed, last with {error!r}") from error
 

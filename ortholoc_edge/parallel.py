@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from itertools import islice
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,6 +20,8 @@ from ortholoc_edge.errors import ConfigError, OrtholocError
 
 _PR_SET_PDEATHSIG = 1
 _DASK_PATIENCE_S = 30.0
+# Pieces that a thread of a cluster has before it.
+_AHEAD = 4
 
 _J = TypeVar("_J")
 _R = TypeVar("_R")
@@ -125,10 +128,18 @@ def _on_dask(
         raise ConfigError(f"--dask {address}: no scheduler answers ({err}); start one with: dask scheduler") from err
     with client:
         check_seen(client, seen, address)
-        futures = {client.submit(work, job, key=name(job), pure=False): job for job in jobs}
+        futures: dict[Any, _J] = {}
         done: queue.Queue[Any] = queue.Queue()
-        for future in futures:
-            future.add_done_callback(done.put)
+        waiting = iter(jobs)
+
+        def submit(most: int) -> None:
+            # Some for each worker, not all at once: a hundred thousand would keep the first result waiting for minutes.
+            for job in islice(waiting, most):
+                future = client.submit(work, job, key=name(job), pure=False)
+                futures[future] = job
+                future.add_done_callback(done.put)
+
+        submit(_AHEAD * max(1, sum(client.nthreads().values())))
         try:
             while futures:
                 try:
@@ -144,7 +155,9 @@ def _on_dask(
                     raise purpose.error(
                         f"--dask {address}: a task failed ({future.exception()}); see the workers' logs"
                     )
-                yield futures.pop(future), future.result()
+                job, result = futures.pop(future), future.result()
+                submit(1)
+                yield job, result
         finally:
             client.cancel(list(futures))
 

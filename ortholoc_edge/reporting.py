@@ -161,6 +161,10 @@ class Reporter:
         self._report_autopilot(now_ns)
         computer = self._computer.read()
         self._link.report_computer(computer)
+        if self._link.connected():
+            self._report_damage()
+            self._report_audit(now_ns)
+            self._report_origin(now_ns)
         if self._bus is not None:
             self.publish_state(now_ns)
             self._bus.publish(self._health(now_ns, computer))
@@ -172,10 +176,6 @@ class Reporter:
         status = "paused by command" if self._commander.paused else self._status(now_ns)
         remark = f"; {self.remark}" if self.remark else ""
         systemd.notify(f"STATUS={status}, {counts['fixes']} fixes, {counts['rejected']} rejected{remark}")
-        if self._link.connected():
-            self._report_damage()
-            self._report_audit(now_ns)
-            self._report_origin(now_ns)
 
     def _page_health(self, now_ns: int, computer: ComputerStatus) -> Health:
         from ortholoc_edge.adapters.page.ground_page import Health

@@ -210,9 +210,14 @@ class Bus:
             return
         self._last_image_ns = stamp_ns
         scale = min(1.0, self._options.image_px / max(image.shape[:2]))
-        small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        drawn = small if small.ndim == 2 else cv2.cvtColor(small, cv2.COLOR_RGB2BGR)
-        data = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, _IMAGE_QUALITY])[1]
+        try:
+            small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+            drawn = small if small.ndim == 2 else cv2.cvtColor(small, cv2.COLOR_RGB2BGR)
+            data = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, _IMAGE_QUALITY])[1]
+        except cv2.error:
+            # One pixel high, say, or of five channels.
+            self.dropped += 1
+            return
         # The stamp tells which fix it belongs to.
         self._put("image", data.tobytes(), "image/jpeg", json.dumps({"stamp_ns": stamp_ns}).encode())
 

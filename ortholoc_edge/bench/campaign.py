@@ -8,13 +8,16 @@ leaves is whole pieces and perhaps half a line, which is cut off.
 from __future__ import annotations
 
 import dataclasses
+import fcntl
 import functools
 import hashlib
+import importlib.metadata
 import os
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import IO
 
 import cv2
 import msgspec
@@ -50,10 +53,14 @@ class MatcherSetup(Struct, frozen=True, kw_only=True):
 class Settings(Struct, frozen=True, kw_only=True):
     """What all results of a run have in common; those of a run with others can't stand in one table with them.
 
-    ``solver``: of the pose.
+    ``method``: raised when this program measures another thing than before. ``solver``: of the pose.
+    ``opencv``, ``onnxruntime``: their versions, which SIFT and networks depend on.
     """
 
+    method: int = 2
     version: str = __version__
+    opencv: str = cv2.__version__
+    onnxruntime: str = importlib.metadata.version("onnxruntime")
     solver: str = pnp.SOLVER
     working_px: int
     max_keypoints: int
@@ -164,8 +171,7 @@ def setup_of(name: str, working_px: int, max_keypoints: int) -> MatcherSetup:
 
 def run_job(job: Job) -> Piece | Failure:
     """In any process."""
-    # One thread each, so that CPU times compare and workers don't fight.
-    cv2.setNumThreads(1)
+    one_thread()
     try:
         return measured(job, read_sample(job.path_of_sample), checked_matcher(job.matcher))
     except DatasetError as error:
@@ -180,6 +186,11 @@ def run_job(job: Job) -> Piece | Failure:
             f"{job.sample}, {job.matcher.name}: failed unexpectedly, please report it:\n{traceback.format_exc()}",
             fatal=True,
         )
+
+
+def one_thread() -> None:
+    """So that CPU times compare and workers don't fight."""
+    cv2.setNumThreads(1)
 
 
 def measured(job: Job, sample: Sample, matcher: Matcher | GroundTruthMatcher) -> Piece:
@@ -236,24 +247,45 @@ def _matcher(setup: MatcherSetup) -> Matcher | GroundTruthMatcher:
 
 @dataclass(slots=True)
 class Store:
-    """Pieces by sample and matcher, on disk too where there is a folder. Owned by the process that plans.
+    """Pieces by sample and matcher, on disk too where there is a folder. Owned by the process that plans; no other may
+    have the same folder at the same time.
 
-    Raises: ConfigError for a folder with a run of other settings; OrtholocError where it can't be written.
+    Raises: ConfigError for a folder with a run of other settings, or that another run uses; OrtholocError where it
+        can't be written.
     """
 
     settings: Settings
     folder: Path | None = None
     _pieces: dict[tuple[str, str], Piece] = field(default_factory=dict)
+    _lock: IO[bytes] | None = None
 
     def __post_init__(self) -> None:
         if self.folder is None:
             return
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            self._check_settings(self.folder / SETTINGS)
-            self._read(self.folder / RESULTS)
+            self._open(self.folder)
         except OSError as err:
+            self.close()
             raise OrtholocError(f"{self.folder}: can't be used ({err}); choose another --out") from err
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        # Until it is closed, or this process ends.
+        self._lock = (folder / ".lock").open("ab")
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(f"{folder}: another run uses it; wait for it, or choose another --out") from None
+        self._check_settings(folder / SETTINGS)
+        self._read(folder / RESULTS)
+
+    def close(self) -> None:
+        """Let others use the folder."""
+        if self._lock is not None:
+            self._lock.close()
 
     def _check_settings(self, path: Path) -> None:
         try:
@@ -334,7 +366,8 @@ class Store:
                 continue
             wanted = {(c, task, adhop) for c in job.conditions for task in job.tasks for adhop in job.adhop}
             results = tuple(result for result in piece.results if _case(result) in wanted)
-            found.append(msgspec.structs.replace(piece, results=results))
+            if results:
+                found.append(msgspec.structs.replace(piece, results=results))
         return found
 
     def _current(self, job: Job) -> Piece | None:

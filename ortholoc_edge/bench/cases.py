@@ -5,14 +5,14 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from ortholoc_edge.bench import metrics
-from ortholoc_edge.bench.campaign import Job, Piece, checked_matcher
+from ortholoc_edge.bench.campaign import Job, Piece, checked_matcher, one_thread
 from ortholoc_edge.bench.condition import USUAL
 from ortholoc_edge.bench.draw import ESTIMATE, TRUTH, captioned
 from ortholoc_edge.bench.evaluation import sample_error
@@ -78,18 +78,20 @@ def _gain(by_setting: dict[bool, Result]) -> float:
     return math.log(before / after)
 
 
-def drawn(cases: Iterable[Case], task: Task) -> Iterator[tuple[Case, ImageArray]]:
-    """RGB pictures of cases, which are matched anew."""
-    for case in cases:
-        sample = read_sample(case.job.path_of_sample)
-        trial = Trial(sample, checked_matcher(case.job.matcher), USUAL, case.job.options, case.adhop is not False)
-        answer = trial.answer(task)
-        if case.adhop is None and answer.second is not None:
-            rounds = [("first round", answer.first), ("AdHoP's round", answer.second)]
-        else:
-            rounds = [("", answer.taken(bool(case.adhop)))]
-        pictures = [match_picture(sample, attempt, f"{case.title} {what}".strip()) for what, attempt in rounds]
-        yield case, np.vstack(pictures)
+def drawn(case: Case, task: Task) -> ImageArray:
+    """RGB picture of a case, which is matched anew.
+
+    Raises: OrtholocError for a sample that can't be read any more.
+    """
+    one_thread()
+    sample = read_sample(case.job.path_of_sample)
+    trial = Trial(sample, checked_matcher(case.job.matcher), USUAL, case.job.options, case.adhop is not False)
+    answer = trial.answer(task)
+    if case.adhop is None and answer.second is not None:
+        rounds = [("first round", answer.first), ("AdHoP's round", answer.second)]
+    else:
+        rounds = [("", answer.taken(bool(case.adhop)))]
+    return np.vstack([match_picture(sample, attempt, f"{case.title} {what}".strip()) for what, attempt in rounds])
 
 
 def match_picture(sample: Sample, attempt: Attempt, what: str) -> ImageArray:

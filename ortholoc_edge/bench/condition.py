@@ -5,6 +5,7 @@ Paper, appendix "Resolution Analysis" and "Covisibility Analysis".
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import replace
 
 import cv2
@@ -43,11 +44,12 @@ def with_map(sample: Sample, condition: Condition, seed: int) -> Sample:
     """The sample with its map cut and coarsened; the photo, and what it shows, as they were.
 
     Args:
-        seed: of the side that is cut off.
+        seed: with the sample's name, of the side that is cut off.
     Raises: DatasetError for a sample without a point map where something is to be cut off.
     """
     if condition.covisibility < 1.0:
-        sample = _cut(sample, condition.covisibility, np.random.default_rng(seed))
+        random = np.random.default_rng([seed, zlib.crc32(sample.name.encode())])
+        sample = _cut(sample, condition.covisibility, random)
     if condition.raster_scale < 1.0:
         sample = _coarsened(sample, condition.raster_scale)
     return sample

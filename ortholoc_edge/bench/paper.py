@@ -160,14 +160,15 @@ class Trial:
         self._second: Round | None = None
         if isinstance(matcher, GroundTruthMatcher):
             timer = Timer()
-            self._first = self._round(matcher.match(self._given), 1.0, timer)
+            self._first = self._round(matcher.match(self._given), (1.0, 1.0), timer)
         else:
             self._match(matcher, adhop)
 
     def _match(self, matcher: Matcher, adhop: bool) -> None:
         grey, window = query_image(self._sample, self._condition), _window(self._given)
         height, width = grey.shape
-        to_photo = self._sample.camera.width / width
+        # Each side was rounded on its own.
+        to_photo = self._sample.camera.width / width, self._sample.camera.height / height
         timer = Timer()
         query = matcher.extract(grey)
 
@@ -195,7 +196,7 @@ class Trial:
             return matches
         return matches.take(np.flatnonzero(matches.confidence > self._condition.min_confidence))
 
-    def _round(self, matches: Matches, to_photo: float, timer: Timer) -> Round:
+    def _round(self, matches: Matches, to_photo: tuple[float, float], timer: Timer) -> Round:
         """Of matches of the picture that the matcher got with pixels of the map that it got."""
         used = self._confident(matches)
         on_sample = self._sample.grid.px_from_map(self._given.grid.map_from_px(used.map_px))

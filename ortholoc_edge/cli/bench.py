@@ -7,6 +7,7 @@ import importlib.util
 import logging
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 
 import msgspec
@@ -93,10 +94,16 @@ def run(args: argparse.Namespace) -> int:
     asked = [study for name in args.study for study in STUDIES[name]]
     # Of blunders in the samples' heights, which each of their many readings would tell again.
     logging.getLogger("ortholoc_edge.bench.samples").setLevel(logging.ERROR)
-    plan = _plan(args, asked)
+    options = PaperOptions(turns=args.turns, seed=args.seed)
+    # First: what is wrong with --out is told before matchers are built.
+    settings = Settings(working_px=args.working_px, max_keypoints=args.max_keypoints, options=options)
+    with closing(Store(settings, args.out)) as store:
+        return _run(args, asked, options, store)
+
+
+def _run(args: argparse.Namespace, asked: Sequence[Study], options: PaperOptions, store: Store) -> int:
+    plan = _plan(args, asked, options)
     jobs = plan.jobs()
-    settings = Settings(working_px=args.working_px, max_keypoints=args.max_keypoints, options=plan.options)
-    store = Store(settings, args.out)
     failures = _measure(plan, store, Workers(args.jobs, args.dask))
     pieces = store.pieces(jobs)
     if args.json:
@@ -112,7 +119,7 @@ def run(args: argparse.Namespace) -> int:
     return 1 if failures else 0
 
 
-def _plan(args: argparse.Namespace, asked: Sequence[Study]) -> Plan:
+def _plan(args: argparse.Namespace, asked: Sequence[Study], options: PaperOptions) -> Plan:
     names = list(args.matcher)
     if any(study.of_truth for study in asked) and GROUND_TRUTH not in names:
         names.append(GROUND_TRUTH)
@@ -122,13 +129,14 @@ def _plan(args: argparse.Namespace, asked: Sequence[Study]) -> Plan:
     if args.limit is not None:
         files = [one for kind in SampleKind for one in [f for f in files if f.kind is kind][: args.limit]]
     return Plan(
-        args.samples,
+        # Workers of a cluster have folders of their own to be in.
+        args.samples.absolute(),
         files,
         [_setup(name, args) for name in names],
         {name: studies.conditions_for(name, asked) for name in names},
         [Task(task) for task in args.task],
         _ADHOP[args.adhop],
-        PaperOptions(turns=args.turns, seed=args.seed),
+        options,
     )
 
 
@@ -192,6 +200,10 @@ def _write(
     ]
     try:
         (folder / _TABLES).mkdir(exist_ok=True)
+        # What an earlier run asked for is of other samples, perhaps.
+        for old in (folder / _TABLES).iterdir():
+            if old.suffix in (".md", ".csv", ".tex", ".png"):
+                old.unlink()
         for table, plot in with_plots:
             stem = folder / _TABLES / table.name
             stem.with_suffix(".md").write_text(table.markdown(), "utf-8")
@@ -209,6 +221,9 @@ def _pictures(plan: Plan, pieces: Sequence[Piece]) -> Iterator[tuple[str, ImageA
     jobs = plan.jobs()
     for task in plan.tasks:
         chosen = cases.choose(pieces, jobs, task)
-        drawn = cases.drawn(chosen, task)
-        for case, picture in tqdm(drawn, total=len(chosen), unit="picture", file=sys.stderr, leave=False):
-            yield f"{task}, {case.title}: {case.job.sample}", picture
+        for case in tqdm(chosen, unit="picture", file=sys.stderr, leave=False):
+            try:
+                yield f"{task}, {case.title}: {case.job.sample}", cases.drawn(case, task)
+            except OrtholocError as error:
+                # The tables are worth having without it.
+                logger.warning("no picture of %s: %s", case.title, error)

@@ -287,8 +287,8 @@ _ALL: Final = (
         name="gim-dkm",
         family="warp",
         files=(WeightsFile("dkm", "gim_dkm_100h.ckpt", "xuelunshen/gim"),),
-        licence="MIT",
-        non_commercial=False,
+        licence="MIT; for research, says its README",
+        non_commercial=True,
         note="GIM (for research, says its README): Shen, Cai, Yin, Müller, Li, Wang, Chen, Wang, ICLR 2024; "
         "DKMv3: Edstedt et al., CVPR 2023",
         million_parameters=70.2,

@@ -118,9 +118,24 @@ class Navigator:
         return self._step(frame, state, _yes(was.proceeded), was.rung)
 
     def _step(self, frame: Frame, state: VehicleState, proceed: Callable[[], bool], rung: int) -> Outcome:
+        orders, self._orders = tuple(self._orders), []
+        try:
+            return self._ordered(orders, frame, state, proceed, rung)
+        except BaseException:
+            # The step is in no log; with the next one they will be, and take effect again.
+            self._orders = [*orders, *self._orders]
+            raise
+
+    def _ordered(
+        self,
+        orders: tuple[Order, ...],
+        frame: Frame,
+        state: VehicleState,
+        proceed: Callable[[], bool],
+        rung: int,
+    ) -> Outcome:
         number, reset_counter, proceeded = self._steps, self.tracker.reset_counter, 0
         self._steps += 1
-        orders, self._orders = tuple(self._orders), []
         for order in orders:
             self.tracker.take(order)
 

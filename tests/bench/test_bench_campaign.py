@@ -7,6 +7,7 @@ import json
 import logging
 import os
 import signal
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,24 @@ def plan(
     return replace(made_plan, **changes)
 
 
+_OPEN: list[Store] = []
+
+
+@pytest.fixture(autouse=True)
+def closed() -> Iterator[None]:
+    yield
+    while _OPEN:
+        _OPEN.pop().close()
+
+
+def stored(folder: Path) -> Store:
+    """One after the other, as runs are."""
+    while _OPEN:
+        _OPEN.pop().close()
+    _OPEN.append(Store(SETTINGS, folder))
+    return _OPEN[-1]
+
+
 def finished(asked: Plan, store: Store, workers: Workers = Workers()) -> list[tuple[int, int, Failure | None]]:  # noqa: B008
     return list(campaign.run(asked, store, workers))
 
@@ -76,7 +95,7 @@ def test_pieces_are_one_sample_and_matcher_each(folder: Path) -> None:
 def test_a_run_that_was_cut_off_goes_on(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "out"
     asked = plan(folder)
-    for count, _ in enumerate(campaign.run(asked, Store(SETTINGS, out), Workers())):
+    for count, _ in enumerate(campaign.run(asked, stored(out), Workers())):
         if count == 3:
             break
     lines = (out / RESULTS).read_bytes()
@@ -87,7 +106,7 @@ def test_a_run_that_was_cut_off_goes_on(folder: Path, tmp_path: Path, monkeypatc
     ran: list[str] = []
     real = campaign.run_job
     monkeypatch.setattr(campaign, "run_job", lambda job: (ran.append(job.key), real(job))[1])
-    store = Store(SETTINGS, out)
+    store = stored(out)
     told = finished(asked, store)
     assert (told[0][:2], told[-1][:2], len(ran)) == ((3, 8), (8, 8), 5)
     assert (out / RESULTS).read_bytes().startswith(lines)
@@ -98,11 +117,11 @@ def test_a_run_that_was_cut_off_goes_on(folder: Path, tmp_path: Path, monkeypatc
 
 def test_what_is_asked_later_is_added(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "out"
-    finished(plan(folder, "orb"), Store(SETTINGS, out))
+    finished(plan(folder, "orb"), stored(out))
     seen: list[tuple[Condition, ...]] = []
     real = campaign.run_job
     monkeypatch.setattr(campaign, "run_job", lambda job: (seen.append(job.conditions), real(job))[1])
-    more, store = plan(folder, "orb", (USUAL, HALF)), Store(SETTINGS, out)
+    more, store = plan(folder, "orb", (USUAL, HALF)), stored(out)
     finished(more, store)
     assert seen == [(HALF,)] * 4
     for piece in store.pieces(more.jobs()):
@@ -115,30 +134,38 @@ def test_what_is_asked_later_is_added(folder: Path, tmp_path: Path, monkeypatch:
 def test_a_sample_that_has_changed_is_measured_again(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     asked = plan(folder, "orb")
-    finished(asked, Store(SETTINGS, out))
+    finished(asked, stored(out))
     changed = folder / "val" / "A_R0000.npz"
     os.utime(changed, (1_700_000_000, 1_700_000_000))
-    store = Store(SETTINGS, out)
+    store = stored(out)
     assert [job.sample for job in asked.jobs() if store.missing(job) is not None] == ["val/A_R0000.npz"]
 
 
 def test_other_settings_do_not_go_into_one_table(folder: Path, tmp_path: Path) -> None:
-    Store(SETTINGS, tmp_path)
+    stored(tmp_path).close()
     with pytest.raises(ConfigError, match=r"holds a run with working_px 320 instead of 640;.*another --out"):
         Store(msgspec.structs.replace(SETTINGS, working_px=640), tmp_path)
     (tmp_path / campaign.SETTINGS).write_text("[]", encoding="utf-8")
     with pytest.raises(ConfigError, match=r"settings\.json: not a benchmark's settings"):
+        stored(tmp_path)
+
+
+def test_two_runs_at_once_do_not_share_a_folder(tmp_path: Path) -> None:
+    first = stored(tmp_path)
+    with pytest.raises(ConfigError, match="another run uses it"):
         Store(SETTINGS, tmp_path)
+    first.close()
+    Store(SETTINGS, tmp_path).close()
 
 
 def test_a_damaged_line_is_named(folder: Path, tmp_path: Path) -> None:
     asked = plan(folder, "orb")
-    finished(asked, Store(SETTINGS, tmp_path))
+    finished(asked, stored(tmp_path))
     path = tmp_path / RESULTS
     lines = path.read_bytes().splitlines(keepends=True)
     path.write_bytes(lines[0] + b"{}\n" + lines[1])
     with pytest.raises(DatasetError, match=r"results\.jsonl, line 2: damaged"):
-        Store(SETTINGS, tmp_path)
+        stored(tmp_path)
 
 
 def test_a_bad_sample_is_told_and_the_others_go_on(folder: Path, tmp_path: Path) -> None:
@@ -209,8 +236,8 @@ def test_a_cluster_gives_the_same_though_a_worker_is_killed(folder: Path) -> Non
 
 def test_results_read_back_as_they_were(folder: Path, tmp_path: Path) -> None:
     asked = plan(folder, "sift", (USUAL, HALF))
-    store = Store(SETTINGS, tmp_path)
+    store = stored(tmp_path)
     finished(asked, store)
-    assert Store(SETTINGS, tmp_path).pieces(asked.jobs()) == store.pieces(asked.jobs())
+    assert stored(tmp_path).pieces(asked.jobs()) == store.pieces(asked.jobs())
     line = json.loads((tmp_path / RESULTS).read_text("utf-8").splitlines()[0])
     assert line["results"][0]["condition"]["covisibility"] == 1.0

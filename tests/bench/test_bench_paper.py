@@ -60,9 +60,10 @@ def test_a_cut_map_shows_the_part_that_is_asked_for(sample: Sample, part: float,
     assert np.array_equal(sample.dop[v : v + given.grid.height, u : u + given.grid.width], given.dop)
 
 
-def test_seeds_cut_off_other_sides(sample: Sample) -> None:
-    cut = {with_map(sample, Condition(covisibility=0.5), seed).grid for seed in range(12)}
-    assert len(cut) == 4
+def test_seeds_and_samples_are_cut_on_sides_of_their_own(sample: Sample) -> None:
+    half = Condition(covisibility=0.5)
+    assert len({with_map(sample, half, seed).grid for seed in range(16)}) == 4
+    assert len({with_map(replace(sample, name=f"D01_R{k:04d}"), half, 0).grid for k in range(16)}) == 4
 
 
 @settings(max_examples=20, deadline=None)
@@ -123,6 +124,29 @@ def test_coordinates_come_back_to_the_whole_photo_and_map(sample: Sample, condit
     for one in results(sample, condition)[:2]:
         assert one.error.me_px < 3.0
         assert one.error.te_m < 1.0
+
+
+def test_a_reduced_photo_of_uneven_sides_has_a_scale_for_each(sample: Sample) -> None:
+    """320 x 240 at 0.14 is 45 x 34 px: one scale for both put the lowest rows 1.8 px off."""
+    condition = Condition(query_scale=0.14)
+    height, width = query_image(sample, condition).shape
+    assert 320 / width != pytest.approx(240 / height, rel=0.005)
+
+    class Small(Turned):
+        """The truth, in the reduced picture's pixels."""
+
+        def match(self, query: Features, reference: Features) -> Matches:
+            u, v = np.meshgrid(np.arange(2.0, width - 2), np.arange(2.0, height - 2))
+            query_px = np.column_stack([u.ravel(), v.ravel()])
+            in_photo = (query_px + 0.5) * (320 / width, 240 / height) - 0.5
+            at = true_map_px(self._sample, in_photo)
+            known = np.isfinite(at).all(axis=1)
+            return Matches(query_px[known], at[known])
+
+    trial = Trial(sample, Small(sample), condition, PaperOptions(turns=1), adhop=False)
+    (one,) = trial.results([Task.LOCALIZE], [False])
+    assert one.error.me_px < 1e-6
+    assert one.error.te_m < 0.01
 
 
 class Turned:

@@ -243,7 +243,7 @@ def test_paper_is_complete() -> None:
     }  # fmt: skip
     assert set(EXPORTED) <= set(MATCHERS)
     assert {entry.name for entry in EXPORTED.values() if entry.non_commercial} == {
-        "superpoint-superglue", "superpoint-lightglue", "dust3r", "mast3r",
+        "superpoint-superglue", "superpoint-lightglue", "gim-dkm", "dust3r", "mast3r",
     }  # fmt: skip
     for entry in EXPORTED.values():
         for file in entry.files:
@@ -339,7 +339,7 @@ def test_list(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert states["xoftr"]["state"].startswith("needs weights_xoftr_640.ckpt from OnderT/XoFTR")
     assert states["dkm"]["state"].startswith("unusable: model dkm")
     assert [name for name, entry in states.items() if entry["non_commercial"]] == [
-        "superpoint-superglue", "superpoint-lightglue", "dust3r", "mast3r",
+        "superpoint-superglue", "superpoint-lightglue", "gim-dkm", "dust3r", "mast3r",
     ]  # fmt: skip
     assert main(["models", "list"]) == 0
     lines = capsys.readouterr().out.splitlines()

@@ -140,6 +140,7 @@ GARBAGE = {
     "a folded header": (b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n folded: x\r\n\r\n", 400),
     "a bare line feed": (b"GET / HTTP/1.1\r\nHost: 127.0.0.1\nX: y\r\n\r\n", 400),
     "a null": (b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: \x00\r\n\r\n", 400),
+    "blanks without end": (b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX:" + b" " * 8000 + b"\x01\r\n\r\n", 400),
     "many headers": (b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n" + b"X: y\r\n" * 100 + b"\r\n", 431),
     "a huge head": (b"GET / HTTP/1.1\r\nX: " + b"y" * 9000, 431),
     "a long path": (b"GET /" + b"a" * 2000 + b" HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n", 400),
