@@ -170,7 +170,7 @@ def test_run_refuses_a_pack_without_the_signature_that_its_configuration_names(p
         lines = [f'public_key = "{public_key}"', f'pack = "{pack}"']
         text = re.sub(r'^pack = "[^"]*"', "\n".join(lines), example.read_text(encoding="utf-8"), flags=re.MULTILINE)
         file.write_text(text, encoding="utf-8")
-        return run.run(argparse.Namespace(config=file))
+        return run.run(argparse.Namespace(config=file, verbose=False))
 
     with pytest.raises(MapError, match="not signed"):
         start(keys[1])
