@@ -14,7 +14,7 @@ import numpy as np
 from ortholoc_edge.bench import metrics
 from ortholoc_edge.bench.campaign import Job, Piece, checked_matcher, one_thread
 from ortholoc_edge.bench.condition import USUAL
-from ortholoc_edge.bench.draw import ESTIMATE, TRUTH, captioned
+from ortholoc_edge.bench.draw import ESTIMATE, TRUTH, at, captioned
 from ortholoc_edge.bench.evaluation import sample_error
 from ortholoc_edge.bench.ground_truth import true_map_px
 from ortholoc_edge.bench.paper import Attempt, Result, Task, Trial
@@ -109,9 +109,9 @@ def match_picture(sample: Sample, attempt: Attempt, what: str) -> ImageArray:
         colour = _UNKNOWN if not np.isfinite(error_px[k]) else _RIGHT if error_px[k] <= _RIGHT_PX else _WRONG
         a = matches.query_px[k] * scale_photo
         b = matches.map_px[k] * scale_map + (photo.shape[1] + _GAP_PX, 0)
-        cv2.line(canvas, _at(a), _at(b), colour, 1, cv2.LINE_AA)
+        cv2.line(canvas, at(a), at(b), colour, 1, cv2.LINE_AA)
         for end in (a, b):
-            cv2.circle(canvas, _at(end), 3, colour, 1, cv2.LINE_AA)
+            cv2.circle(canvas, at(end), 3, colour, 1, cv2.LINE_AA)
     error = sample_error(sample, matches, attempt.estimate)
     keypoints = np.zeros((0, 3)) if sample.keypoints is None else sample.keypoints
     keypoints = keypoints[:: max(1, len(keypoints) // _MOST_DOTS)]
@@ -151,9 +151,4 @@ def _dots(
 ) -> None:
     px = camera.project(map_from_camera.inverse().apply(points)) * scale
     for point in px[np.isfinite(px).all(axis=1)]:
-        cv2.circle(canvas, _at(point), radius, colour, 1, cv2.LINE_AA)
-
-
-def _at(px: FloatArray) -> tuple[int, int]:
-    u, v = np.clip(px, -20_000, 20_000)
-    return round(float(u)), round(float(v))
+        cv2.circle(canvas, at(point), radius, colour, 1, cv2.LINE_AA)

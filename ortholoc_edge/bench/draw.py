@@ -66,7 +66,7 @@ def overlay(image: ImageArray, outcome: Outcome, truth: Rigid3 | None, camera: C
             true = camera.project(truth.inverse().apply(points))
             for a, b in zip(true, estimated, strict=True):
                 if np.isfinite([a, b]).all():
-                    cv2.line(canvas, _at(a), _at(b), DIFFERENCE, 1, cv2.LINE_AA)
+                    cv2.line(canvas, at(a), at(b), DIFFERENCE, 1, cv2.LINE_AA)
             _dots(canvas, true, TRUTH, 3)
         _dots(canvas, estimated, ESTIMATE, 2)
     return captioned(canvas, caption)
@@ -114,7 +114,8 @@ def write_png(path: Path, image: ImageArray) -> None:
         raise OrtholocError(f"{path}: can't write the picture ({err})") from err
 
 
-def _at(px: FloatArray) -> tuple[int, int]:
+def at(px: FloatArray) -> tuple[int, int]:
+    """A pixel as OpenCV draws there."""
     # Far off the picture, coordinates would overflow OpenCV's integers.
     u, v = np.clip(px, -20_000, 20_000)
     return round(float(u)), round(float(v))
@@ -122,8 +123,8 @@ def _at(px: FloatArray) -> tuple[int, int]:
 
 def _dots(canvas: ImageArray, px: FloatArray, colour: Colour, radius: int) -> None:
     for point in px[np.isfinite(px).all(axis=1)]:
-        cv2.circle(canvas, _at(point), radius + 1, _PAPER, -1, cv2.LINE_AA)
-        cv2.circle(canvas, _at(point), radius, colour, -1, cv2.LINE_AA)
+        cv2.circle(canvas, at(point), radius + 1, _PAPER, -1, cv2.LINE_AA)
+        cv2.circle(canvas, at(point), radius, colour, -1, cv2.LINE_AA)
 
 
 def captioned(canvas: ImageArray, caption: str) -> ImageArray:
@@ -147,7 +148,7 @@ def _furniture(canvas: ImageArray, grid: RasterGrid, convergence_rad: float, tra
     foot = np.array([width - 40.0, 74.0])
     tip = foot + 48.0 * np.array([-math.sin(convergence_rad), -math.cos(convergence_rad)])
     cv2.rectangle(canvas, (width - 62, 14), (width - 18, 98), _PAPER, -1)
-    cv2.arrowedLine(canvas, _at(foot), _at(tip), _INK, 3, cv2.LINE_AA, tipLength=0.35)
+    cv2.arrowedLine(canvas, at(foot), at(tip), _INK, 3, cv2.LINE_AA, tipLength=0.35)
     cv2.putText(canvas, "N", (width - 46, 92), _FONT, 0.6, _INK, 1, cv2.LINE_AA)
     widest = max((len(t.label) for t in tracks), default=0)
     cv2.rectangle(canvas, (10, 10), (50 + 10 * widest, 18 + 22 * len(tracks)), _PAPER, -1)

@@ -10,7 +10,7 @@ import numpy as np
 from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
 from ortholoc_edge.matching.inference import Inference
 from ortholoc_edge.matching.types import Features
-from ortholoc_edge.matching.working_image import working_image
+from ortholoc_edge.matching.working_image import check_numbers, working_image
 from ortholoc_edge.matching.xfeat import MULTIPLE_PX, working_size
 
 DESCRIPTOR: Final = 128
@@ -110,11 +110,7 @@ class AlikedExtractor:
         max_keypoints: int = 1024,
         threads: int = 1,
     ) -> None:
-        if working_px < 2 * MULTIPLE_PX or working_px % MULTIPLE_PX or max_keypoints < 1 or threads < 1:
-            raise ValueError(
-                f"ALIKED: working_px {working_px} must be a multiple of {MULTIPLE_PX} from {2 * MULTIPLE_PX} on, "
-                f"max_keypoints {max_keypoints} and threads {threads} at least 1"
-            )
+        check_numbers("ALIKED", MULTIPLE_PX, 2 * MULTIPLE_PX, working_px, max_keypoints, threads)
         self._working_px = working_px
         self._max_keypoints = max_keypoints
         self._network = AlikedNetwork(picture, descriptors, threads)
@@ -126,16 +122,12 @@ class AlikedExtractor:
         """
         work = working_image(image, valid, *working_size(image.shape, self._working_px))
         if work is None:
-            return _no_features()
+            return Features.none(DESCRIPTOR)
         features, scores = self._network.run(work.image)
         pixels, best = _keypoints(scores, work.usable, self._max_keypoints)
         if len(pixels) == 0:
-            return _no_features()
+            return Features.none(DESCRIPTOR)
         return Features(work.original_px(pixels), best, self._network.describe(features, pixels))
-
-
-def _no_features() -> Features:
-    return Features(np.empty((0, 2)), np.empty(0, np.float32), np.empty((0, DESCRIPTOR), np.float32))
 
 
 def _keypoints(scores: Float32Array, usable: BoolArray | None, limit: int) -> tuple[FloatArray, Float32Array]:

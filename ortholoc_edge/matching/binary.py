@@ -66,11 +66,11 @@ class BinaryMatcher:
         """
         work = shrunk_image(image, valid, self.working_px)
         if work is None:
-            return self._no_features()
+            return Features.none(self._bits)
         # Per call: OpenCV does not promise that a detector may serve two threads.
         keypoints, packed = self._detector(self._max_keypoints).detectAndCompute(work.image, None)
         if not keypoints:
-            return self._no_features()
+            return Features.none(self._bits)
         pixels = self._pixels(keypoints, work.image.shape)
         scores = np.array([keypoint.response for keypoint in keypoints], dtype=np.float32)
         order = work.strongest(pixels, scores, self._max_keypoints)
@@ -88,9 +88,6 @@ class BinaryMatcher:
         nominal = _ORB_STEP ** np.array([keypoint.octave for keypoint in keypoints])[:, None]
         size = np.array(shape[1::-1])
         return (pixels / nominal + 0.5) * (size / np.rint(size / nominal)) - 0.5
-
-    def _no_features(self) -> Features:
-        return Features(np.empty((0, 2)), np.empty(0, np.float32), np.empty((0, self._bits), np.float32))
 
     def match(self, query: Features, reference: Features) -> Matches:
         """Mutual nearest neighbours that pass the ratio test; ``confidence`` None, a ratio is no probability."""

@@ -75,7 +75,7 @@ class DedodeMatcher:
                 feeds = {"picture": picture, "keypoints": found.astype(np.float32)}
                 descriptors = self._descriptor.run(feeds, f"{len(found)} keypoints")[0]
                 return Features(work.original_px(found), scores, descriptors)
-        return Features(np.empty((0, 2)), np.empty(0, np.float32), np.empty((0, DESCRIPTOR), np.float32))
+        return Features.none(DESCRIPTOR)
 
     def match(self, query: Features, reference: Features) -> Matches:
         """Pairs that are each other's likeliest. ``confidence`` None: the product of softmaxes is small for right

@@ -10,7 +10,7 @@ import numpy as np
 from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, ImageArray, IntArray
 from ortholoc_edge.matching.inference import Inference
 from ortholoc_edge.matching.types import Features
-from ortholoc_edge.matching.working_image import WorkingImage, working_image
+from ortholoc_edge.matching.working_image import WorkingImage, check_numbers, working_image
 from ortholoc_edge.matching.xfeat import parabola_offsets, working_size
 
 DESCRIPTOR: Final = 128
@@ -93,11 +93,7 @@ class DiskExtractor:
         max_keypoints: int = 1024,
         threads: int = 1,
     ) -> None:
-        if working_px < 2 * MULTIPLE_PX or working_px % MULTIPLE_PX or max_keypoints < 1 or threads < 1:
-            raise ValueError(
-                f"DISK: working_px {working_px} must be a multiple of {MULTIPLE_PX} from {2 * MULTIPLE_PX} on, "
-                f"max_keypoints {max_keypoints} and threads {threads} at least 1"
-            )
+        check_numbers("DISK", MULTIPLE_PX, 2 * MULTIPLE_PX, working_px, max_keypoints, threads)
         self._working_px = working_px
         self._max_keypoints = max_keypoints
         self._network = DiskNetwork(picture, descriptors, threads)
@@ -112,17 +108,13 @@ class DiskExtractor:
         """
         work = working_image(image, valid, *working_size(image.shape, self._working_px, MULTIPLE_PX))
         if work is None:
-            return _no_features()
+            return Features.none(DESCRIPTOR)
         features, heat = self._network.run(work.image)
         pixels, best = _keypoints(heat, work, self._max_keypoints)
         if len(pixels) == 0:
-            return _no_features()
+            return Features.none(DESCRIPTOR)
         refined = pixels + parabola_offsets(heat, pixels[:, 1], pixels[:, 0])
         return Features(work.original_px(refined), best, self._network.describe(features, pixels))
-
-
-def _no_features() -> Features:
-    return Features(np.empty((0, 2)), np.empty(0, np.float32), np.empty((0, DESCRIPTOR), np.float32))
 
 
 def _keypoints(heat: Float32Array, work: WorkingImage, limit: int) -> tuple[IntArray, Float32Array]:

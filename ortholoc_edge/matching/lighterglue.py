@@ -140,11 +140,16 @@ class LighterGlueMatcher(GlueMatcher):
         )
 
 
-class AlikedLightGlueMatcher(GlueMatcher):
-    """ALIKED's features. Args and errors as of `LighterGlueMatcher`; ``picture`` and ``descriptors`` are ALIKED's."""
+class LightGlueMatcher(GlueMatcher):
+    """ALIKED's or DISK's features, whose ``extractor`` takes two graphs, ``picture`` and ``descriptors``.
+
+    Args and errors as of `LighterGlueMatcher`; working sides are multiples of what the extractor asks for.
+    """
 
     def __init__(
         self,
+        name: str,
+        extractor: type[AlikedExtractor] | type[DiskExtractor],
         picture: tuple[bytes, str],
         descriptors: tuple[bytes, str],
         network: tuple[bytes, str],
@@ -153,7 +158,7 @@ class AlikedLightGlueMatcher(GlueMatcher):
         max_keypoints: int = MOST_KEYPOINTS,
         threads: int = 1,
     ) -> None:
-        aliked = AlikedExtractor(
+        features = extractor(
             picture,
             descriptors,
             working_px=working_px,
@@ -161,32 +166,7 @@ class AlikedLightGlueMatcher(GlueMatcher):
             threads=threads,
         )
         hashes = [picture[1], descriptors[1]]
-        super().__init__("aliked-lightglue", aliked, hashes, network, working_px=working_px, threads=threads)
-
-
-class DiskLightGlueMatcher(GlueMatcher):
-    """DISK's features. Args and errors as of `LighterGlueMatcher`, working sides are multiples of 16; ``picture`` and
-    ``descriptors`` are DISK's."""
-
-    def __init__(
-        self,
-        picture: tuple[bytes, str],
-        descriptors: tuple[bytes, str],
-        network: tuple[bytes, str],
-        *,
-        working_px: int = 640,
-        max_keypoints: int = MOST_KEYPOINTS,
-        threads: int = 1,
-    ) -> None:
-        disk = DiskExtractor(
-            picture,
-            descriptors,
-            working_px=working_px,
-            max_keypoints=min(max_keypoints, MOST_KEYPOINTS),
-            threads=threads,
-        )
-        hashes = [picture[1], descriptors[1]]
-        super().__init__("disk-lightglue", disk, hashes, network, working_px=working_px, threads=threads)
+        super().__init__(name, features, hashes, network, working_px=working_px, threads=threads)
 
 
 def _places(features: Features) -> Float32Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -157,11 +158,9 @@ def _paired(
     name: str, working_px: int, max_keypoints: int, threads: int, progress: models.Progress | None
 ) -> Matcher:
     # Late for the same reason.
-    from ortholoc_edge.matching.lighterglue import (
-        AlikedLightGlueMatcher,
-        DiskLightGlueMatcher,
-        LighterGlueMatcher,
-    )
+    from ortholoc_edge.matching.aliked import AlikedExtractor
+    from ortholoc_edge.matching.disk import DiskExtractor
+    from ortholoc_edge.matching.lighterglue import LighterGlueMatcher, LightGlueMatcher
     from ortholoc_edge.matching.xfeat_star import XFeatStarMatcher
 
     stored = [models.ensure(one, progress) for one in (name, *models.known(name).needs)]
@@ -172,8 +171,8 @@ def _paired(
         )
     kinds: dict[str, Callable[..., Matcher]] = {
         "xfeat-lighterglue": LighterGlueMatcher,
-        "aliked-lightglue": AlikedLightGlueMatcher,
-        "disk-lightglue": DiskLightGlueMatcher,
+        "aliked-lightglue": partial(LightGlueMatcher, name, AlikedExtractor),
+        "disk-lightglue": partial(LightGlueMatcher, name, DiskExtractor),
     }
     return kinds[name](*needed, own, working_px=working_px, max_keypoints=max_keypoints, threads=threads)
 

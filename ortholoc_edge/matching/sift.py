@@ -51,7 +51,7 @@ class SiftMatcher:
         """
         work = shrunk_image(image, valid, self.working_px)
         if work is None:
-            return _no_features()
+            return Features.none(_DESCRIPTOR)
         # Without enable_precise_upscale keypoints are a quarter pixel off (seen on the recorded samples). A
         # detector per call: OpenCV does not promise that one may serve two threads.
         detector = cv2.SIFT.create(
@@ -59,7 +59,7 @@ class SiftMatcher:
         )
         keypoints, raw = detector.detectAndCompute(work.image, None)
         if not keypoints:
-            return _no_features()
+            return Features.none(_DESCRIPTOR)
         pixels = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64)
         scores = np.array([keypoint.response for keypoint in keypoints], dtype=np.float32)
         # OpenCV keeps more than asked for where the last ones tie.
@@ -73,7 +73,3 @@ class SiftMatcher:
         """Mutual nearest neighbours that pass the ratio test; ``confidence`` None, a ratio is no probability."""
         i, j = mutual_nearest(query.descriptors, reference.descriptors, _ANY_COSINE, self._ratio)
         return Matches(query.keypoints_px[i], reference.keypoints_px[j])
-
-
-def _no_features() -> Features:
-    return Features(np.empty((0, 2)), np.empty(0, np.float32), np.empty((0, _DESCRIPTOR), np.float32))

@@ -15,7 +15,7 @@ from ortholoc_edge.matching.inference import Inference
 from ortholoc_edge.matching.lighterglue import GlueMatcher, mutual_best
 from ortholoc_edge.matching.models import joint_sha256
 from ortholoc_edge.matching.types import Features, Matcher, Matches
-from ortholoc_edge.matching.working_image import working_image
+from ortholoc_edge.matching.working_image import check_numbers, working_image
 
 DESCRIPTOR: Final = 256
 CELL_PX: Final = 8
@@ -54,11 +54,7 @@ class SuperPointExtractor:
         max_keypoints: int = 2048,
         threads: int = 1,
     ) -> None:
-        if working_px < 4 * CELL_PX or working_px % CELL_PX or max_keypoints < 1 or threads < 1:
-            raise ValueError(
-                f"SuperPoint: working_px {working_px} must be a multiple of {CELL_PX} from {4 * CELL_PX} on, "
-                f"max_keypoints {max_keypoints} and threads {threads} at least 1"
-            )
+        check_numbers("SuperPoint", CELL_PX, 4 * CELL_PX, working_px, max_keypoints, threads)
         self._min_score = min_score
         self._working_px = working_px
         self._max_keypoints = max_keypoints

@@ -32,6 +32,11 @@ class Features:
     lengths: Float32Array | None = None
     spacing_px: FloatArray | None = None
 
+    @staticmethod
+    def none(length: int) -> Features:
+        """Of a picture that shows nothing; ``length``: of a descriptor."""
+        return Features(np.empty((0, 2)), np.empty(0, np.float32), np.empty((0, length), np.float32))
+
     def __len__(self) -> int:
         return len(self.keypoints_px)
 

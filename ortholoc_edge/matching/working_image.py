@@ -71,6 +71,17 @@ def shrunk_image(image: ImageArray, valid: BoolArray | None, working_px: int) ->
     return working_image(image, valid, max(1, round(columns * shrink)), max(1, round(rows * shrink)))
 
 
+def check_numbers(
+    what: str, multiple_px: int, least_px: int, working_px: int, max_keypoints: int, threads: int
+) -> None:
+    """What every extractor with a network is made with. Raises: ValueError naming the numbers and their limits."""
+    if working_px < least_px or working_px % multiple_px or max_keypoints < 1 or threads < 1:
+        raise ValueError(
+            f"{what}: working_px {working_px} must be a multiple of {multiple_px} from {least_px} on, "
+            f"max_keypoints {max_keypoints} and threads {threads} at least 1"
+        )
+
+
 def working_image(image: ImageArray, valid: BoolArray | None, width: int, height: int) -> WorkingImage | None:
     """``image`` (H, W) uint8 in ``width`` x ``height`` pixels; None where there is nothing to find in it.
 

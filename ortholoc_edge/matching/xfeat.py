@@ -11,7 +11,7 @@ from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, I
 from ortholoc_edge.matching.inference import Inference
 from ortholoc_edge.matching.nearest import mutual_nearest
 from ortholoc_edge.matching.types import Features, Matches
-from ortholoc_edge.matching.working_image import WorkingImage, working_image
+from ortholoc_edge.matching.working_image import WorkingImage, check_numbers, working_image
 
 _INPUT: Final = "normalised"
 _OUTPUTS: Final = ["features", "heat", "reliability"]
@@ -79,11 +79,7 @@ class XFeatMatcher:
         min_cosine: float = 0.82,
         threads: int = 1,
     ) -> None:
-        if working_px < 2 * MULTIPLE_PX or working_px % MULTIPLE_PX or max_keypoints < 1 or threads < 1:
-            raise ValueError(
-                f"XFeat: working_px {working_px} must be a multiple of {MULTIPLE_PX} from {2 * MULTIPLE_PX} on, "
-                f"max_keypoints {max_keypoints} and threads {threads} at least 1"
-            )
+        check_numbers("XFeat", MULTIPLE_PX, 2 * MULTIPLE_PX, working_px, max_keypoints, threads)
         self.name = "xfeat"
         self.model_sha256: str | None = sha256.lower()
         self.working_px = working_px
@@ -115,7 +111,7 @@ class XFeatMatcher:
 
     def _extracted(self, work: WorkingImage | None) -> Features:
         if work is None:
-            return no_features()
+            return Features.none(DESCRIPTOR)
         features, heat, reliability = self._network.run(work.image, work.usable)
         pixels, scores = _keypoints(heat[0, 0], reliability[0, 0], work.usable, self._max_keypoints)
         # Rows of channels, so that a cell's 64 numbers lie together.
@@ -130,10 +126,6 @@ class XFeatMatcher:
         """
         i, j = mutual_nearest(query.descriptors, reference.descriptors, self._min_cosine)
         return Matches(query.keypoints_px[i], reference.keypoints_px[j])
-
-
-def no_features() -> Features:
-    return Features(np.empty((0, 2)), np.empty(0, np.float32), np.empty((0, DESCRIPTOR), np.float32))
 
 
 def normalised(grey: ImageArray, usable: BoolArray | None) -> Float32Array:

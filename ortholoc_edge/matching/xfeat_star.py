@@ -16,7 +16,7 @@ from ortholoc_edge.matching.inference import Inference
 from ortholoc_edge.matching.models import joint_sha256
 from ortholoc_edge.matching.nearest import mutual_nearest
 from ortholoc_edge.matching.types import Features, Matches
-from ortholoc_edge.matching.working_image import WorkingImage, working_image
+from ortholoc_edge.matching.working_image import WorkingImage, check_numbers, working_image
 from ortholoc_edge.matching.xfeat import CELL_PX, DESCRIPTOR, MULTIPLE_PX, normalised, working_size
 
 _INPUT: Final = "normalised"
@@ -90,11 +90,7 @@ class XFeatStarMatcher:
         max_keypoints: int = 4096,
         threads: int = 1,
     ) -> None:
-        if working_px < 2 * MULTIPLE_PX or working_px % MULTIPLE_PX or max_keypoints < 1 or threads < 1:
-            raise ValueError(
-                f"XFeat*: working_px {working_px} must be a multiple of {MULTIPLE_PX} from {2 * MULTIPLE_PX} on, "
-                f"max_keypoints {max_keypoints} and threads {threads} at least 1"
-            )
+        check_numbers("XFeat*", MULTIPLE_PX, 2 * MULTIPLE_PX, working_px, max_keypoints, threads)
         self.name = "xfeat-star"
         self.model_sha256: str | None = joint_sha256(dense[1], fine[1])
         self.working_px = working_px
