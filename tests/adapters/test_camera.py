@@ -14,7 +14,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ortholoc_edge.adapters import camera
 from ortholoc_edge.adapters.camera import (
     BadFrameError,
     CameraOptions,
@@ -25,6 +24,7 @@ from ortholoc_edge.adapters.camera import (
     open_source,
     read_image,
 )
+from ortholoc_edge.adapters.camera.pictures import rgb
 from ortholoc_edge.clock import ManualClock, SystemClock
 from ortholoc_edge.errors import CameraError, ConfigError
 
@@ -394,8 +394,8 @@ def test_options_are_strict(document):
 
 def test_pixels_that_are_not_8_bit_are_refused_by_name():
     with pytest.raises(CameraError, match=r"camera x gives uint16"):
-        camera._rgb(np.full((4, 4, 3), 300, np.uint16), "camera x")
+        rgb(np.full((4, 4, 3), 300, np.uint16), "camera x")
     with pytest.raises(CameraError, match=r"camera x gives uint16"):
-        camera._rgb(np.full((4, 4), 300, np.uint16), "camera x")
-    grey = camera._rgb(np.full((4, 4), 30, np.uint8), "camera x")
+        rgb(np.full((4, 4), 300, np.uint16), "camera x")
+    grey = rgb(np.full((4, 4), 30, np.uint8), "camera x")
     assert grey.shape == (4, 4, 3) and (grey == 30).all() and not grey.flags.writeable
