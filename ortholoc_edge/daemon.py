@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 from ortholoc_edge.adapters import systemd
-from ortholoc_edge.adapters.bus import Bus
+from ortholoc_edge.adapters.bus import Bus, bus_of
 from ortholoc_edge.adapters.camera import BadFrameError, EndOfFrames, FrameSource, open_source
 from ortholoc_edge.adapters.commands import Answer, BusyError, Desk
 from ortholoc_edge.adapters.flight_log import FlightLog
@@ -177,9 +177,8 @@ class Daemon:
                 log=self._log,
                 snapshots=_snapshot_folder(config),
             )
-            credentials = os.environ.get("CREDENTIALS_DIRECTORY")
             self._bus = (
-                resources.enter_context(closing(Bus(config.bus, Path(credentials) if credentials else None)))
+                resources.enter_context(closing(bus_of(config.bus, config.camera.source, os.environ)))
                 if config.bus.enabled
                 else None
             )
@@ -200,7 +199,8 @@ class Daemon:
                 page=page,
                 on_outcome=on_outcome,
             )
-            self._frames = resources.enter_context(closing(frames or open_source(config.camera, self._clock)))
+            source = frames or open_source(config.camera, self._clock, self._bus)
+            self._frames = resources.enter_context(closing(source))
             self._resources = resources.pop_all()
         self._ended = threading.Event()
         self._capture_failure: BaseException | None = None

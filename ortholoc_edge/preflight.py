@@ -12,12 +12,14 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
+from ortholoc_edge.adapters.bus import bus_of
 from ortholoc_edge.adapters.camera import BadFrameError, EndOfFrames, FrameSource, open_source
 from ortholoc_edge.adapters.computer import ComputerReader, ComputerStatus
 from ortholoc_edge.adapters.mavlink.audit import Finding, Level
@@ -27,7 +29,7 @@ from ortholoc_edge.adapters.page.options import read_token
 from ortholoc_edge.clock import Clock, wall_clock_ns
 from ortholoc_edge.config import Config
 from ortholoc_edge.daemon import require_flyable
-from ortholoc_edge.errors import CameraError, ConfigError, MapError, OrtholocError
+from ortholoc_edge.errors import CameraError, ConfigError, LinkError, MapError, OrtholocError
 from ortholoc_edge.matching import models
 from ortholoc_edge.matching.types import STRUCTURAL
 from ortholoc_edge.pipeline.frame import Frame
@@ -56,7 +58,16 @@ def check_computer(config: Config, clock: Clock, environ: Mapping[str, str]) -> 
     pictures: list[Finding] = []
     # One that is not there would be waited for.
     if not any(finding.subject == "camera" for finding in devices):
-        seen = look(lambda: open_source(config.camera, clock), clock)
+        with ExitStack() as closed_last:
+
+            def opened() -> FrameSource:
+                bus = None
+                if config.camera.source.startswith("zenoh:") and config.bus.enabled:
+                    bus = bus_of(config.bus, config.camera.source, environ)
+                    closed_last.callback(bus.close)
+                return open_source(config.camera, clock, bus)
+
+            seen = look(opened, clock)
         pictures = [seen] if isinstance(seen, Finding) else check_look(config, seen)
     return [
         *check_clock(wall_clock_ns(), is_synchronised()),
@@ -282,7 +293,8 @@ def check_disk(config: Config, usage: Callable[[Path], Usage]) -> list[Finding]:
         return [
             Finding(
                 Level.ERROR, "log folder", f"{config.log.folder} may not be written to by this user", "writable",
-                "without it the daemon does not start", "give it to the user that flies, or name another [log] folder",
+                "the daemon flies without a log, and tries again",
+                "give it to the user that flies, or name another [log] folder",
             )
         ]  # fmt: skip
     if found.free_mib < config.log.max_mb:
@@ -322,7 +334,7 @@ def look(opened: Callable[[], FrameSource], clock: Clock, seconds: float = _LOOK
     """Take frames for a while. A finding where the source can't be opened."""
     try:
         source = opened()
-    except (CameraError, ConfigError) as error:
+    except (CameraError, ConfigError, LinkError) as error:
         return _error("camera", error, "frames", "without it the daemon does not start")
     frames: list[Frame] = []
     bad = 0

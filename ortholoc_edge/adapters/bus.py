@@ -9,6 +9,7 @@ alive                                       liveliness token
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import re
@@ -51,6 +52,8 @@ _MAX_PORT = 65535
 # Nothing that we take is of more than 4 kB; a peer that sends more than this at once is cut off before it fills the
 # memory (zenoh's own limit is a gigabyte).
 _MOST_RECEIVED_BYTES = 1 << 20
+# Where the camera's pictures come over it: a JPEG of twelve megapixels has six megabytes.
+_MOST_PICTURE_BYTES = 16 << 20
 _MOST_WAITING_COMMANDS = 16
 _IMAGE_QUALITY = 70
 
@@ -115,14 +118,15 @@ class Bus:
     Attributes:
         dropped: messages that could not be published.
         refused: commands that were not carried out.
-    Raises on construction: ConfigError if an endpoint is malformed; LinkError if the session can't be opened, which
-        may pass (a port still in use, an interface that is not up yet).
+    Raises on construction: ConfigError if an endpoint is malformed; LinkError if no session can be had. A port that is
+        in use is waited for, in the background.
     """
 
-    def __init__(self, options: BusOptions, credentials: Path | None = None) -> None:
+    def __init__(self, options: BusOptions, credentials: Path | None = None, *, takes_pictures: bool = False) -> None:
         """
         Args:
             credentials: systemd's folder of them.
+            takes_pictures: whether `listen_to` will be used, so that longer messages must be let in.
         """
         import zenoh
 
@@ -136,9 +140,9 @@ class Bus:
         self._thread: threading.Thread | None = None
         self._latest: dict[str, tuple[bytes, str]] = {}
         self._last_image_ns: int | None = None
-        config = _session_config(options, credentials)
+        config = _session_config(options, credentials, _MOST_PICTURE_BYTES if takes_pictures else _MOST_RECEIVED_BYTES)
         try:
-            self._session = zenoh.open(config)
+            self._session = self._open(config)
         except zenoh.ZError as err:
             raise self._not_open(err) from err
         try:
@@ -175,11 +179,51 @@ class Bus:
         self._thread = threading.Thread(target=self._serve_commands, name="bus-commands", daemon=True)
         self._thread.start()
 
+    def _open(self, config: zenoh.Config) -> zenoh.Session:
+        """Raises: zenoh.ZError."""
+        import zenoh
+
+        try:
+            return zenoh.open(config)
+        except zenoh.ZError as err:
+            if not self._options.listen:
+                raise
+            # A port that another program holds, or an interface that is not up yet: no reason not to fly.
+            logger.warning("%s; flying without who connects there, it is tried again and again", self._not_open(err))
+        for key, value in {"listen/timeout_ms": -1, "listen/exit_on_failure": False}.items():
+            config.insert_json5(key, json.dumps(value))
+        return zenoh.open(config)
+
     def _not_open(self, err: zenoh.ZError) -> LinkError:
         return LinkError(
             f"zenoh can't listen on {', '.join(self._options.listen)} as {self._prefix!r} ({err}); free the port, or "
             "choose another in [bus] of the configuration"
         )
+
+    def listen_to(self, key: str, handler: Callable[[bytes, bytes], None]) -> Callable[[], None]:
+        """Have ``handler`` called with payload and attachment of each message of a key, in a thread of the bus.
+
+        Returns: what ends it.
+        Raises: ConfigError for what is no key.
+        """
+
+        def hand_over(sample: zenoh.Sample) -> None:
+            try:
+                attachment = sample.attachment
+                handler(sample.payload.to_bytes(), b"" if attachment is None else attachment.to_bytes())
+            except Exception:  # one message; the next may do better
+                logger.exception("zenoh: message of %s not taken", key)
+
+        def end() -> None:
+            # The session may be closed already.
+            with contextlib.suppress(self._error):
+                subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+        try:
+            subscriber = self._session.declare_subscriber(key, hand_over)
+        except self._error as err:
+            raise ConfigError(f"{key!r} is no key of zenoh ({err}); write words with slashes between them") from err
+        return end
 
     def retune(self, options: BusOptions) -> None:
         """Take over ``commands``, ``image_rate_hz`` and ``image_px``; the rest was used at the start."""
@@ -313,10 +357,17 @@ class Bus:
             self._thread.join(timeout=1.0)
 
 
+def bus_of(options: BusOptions, camera_source: str, environ: Mapping[str, str]) -> Bus:
+    """As configured, with systemd's credentials. Raises: ConfigError, LinkError."""
+    credentials = environ.get("CREDENTIALS_DIRECTORY")
+    takes_pictures = camera_source.startswith("zenoh:")
+    return Bus(options, Path(credentials) if credentials else None, takes_pictures=takes_pictures)
+
+
 _TOPIC_OF = {kind: name for name, kind in PUBLISHED.items()}
 
 
-def _session_config(options: BusOptions, credentials: Path | None) -> zenoh.Config:
+def _session_config(options: BusOptions, credentials: Path | None, most_received_bytes: int) -> zenoh.Config:
     """Raises: ConfigError naming the endpoint or file that can't be used."""
     import zenoh
 
@@ -330,7 +381,7 @@ def _session_config(options: BusOptions, credentials: Path | None) -> zenoh.Conf
         "mode": "peer",
         "scouting/multicast/enabled": False,
         "listen/endpoints": list(options.listen),
-        "transport/link/rx/max_message_size": _MOST_RECEIVED_BYTES,
+        "transport/link/rx/max_message_size": most_received_bytes,
         **_tls_settings(options.tls, credentials),
     }
     if options.connect:

@@ -37,7 +37,6 @@ from msgspec import Meta, Struct
 
 from ortholoc_edge import __version__
 from ortholoc_edge.adapters.messages import Command, CommandReply
-from ortholoc_edge.errors import OrtholocError
 from ortholoc_edge.geometry import covariance as cov
 from ortholoc_edge.geometry import frames, rotation
 from ortholoc_edge.geometry.arrays import ImageArray
@@ -141,9 +140,10 @@ class FlightLog:
 
     What can't be written (a full disk, a slow card) is dropped and counted: logging must not end a flight.
 
+    A folder that can't be written to is tried again, each second.
+
     Attributes:
         dropped: frames not written.
-    Raises on construction: OrtholocError if the folder can't be written to.
     """
 
     def __init__(
@@ -170,12 +170,15 @@ class FlightLog:
         self._part = 0
         self._failing = False
         self._failed_ns = 0
+        self._started_unix_ns = started_ns + unix_minus_stamp_ns
+        self._session: str | None = None
+        self._file: _File | None = None
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            self._session = self._next_session(started_ns + unix_minus_stamp_ns)
-            self._file: _File | None = self._open()
+            self._file = self._open()
         except OSError as err:
-            raise OrtholocError(f"{self._folder}: can't write the log there ({err}); see log.folder") from err
+            # A restart in flight must not end here: the vehicle needs its position more than its log.
+            logger.warning("%s: can't write the log there (%s); see log.folder. Flying without", self._folder, err)
+            self._failing, self._failed_ns = True, started_ns
         self._queue: queue.Queue[_Entry | _Note | None] = queue.Queue(_QUEUE_LENGTH)
         self._thread = threading.Thread(target=self._run, name="flight-log", daemon=True)
         self._thread.start()
@@ -336,12 +339,15 @@ class FlightLog:
 
     # -- files -----------------------------------------------------------------------------------------
 
-    def _next_session(self, unix_ns: int) -> str:
+    def _next_session(self) -> str:
         numbers = [int(path.name.split("-")[1]) for path in self._folder.glob("flight-[0-9]*-*.mcap")]
-        date = datetime.datetime.fromtimestamp(unix_ns // _S, datetime.UTC).strftime("%Y%m%dT%H%M%SZ")
+        date = datetime.datetime.fromtimestamp(self._started_unix_ns // _S, datetime.UTC).strftime("%Y%m%dT%H%M%SZ")
         return f"{max(numbers, default=0) + 1:05d}-{date}"
 
     def _open(self) -> _File:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        if self._session is None:
+            self._session = self._next_session()
         self._make_room()
         header = LogHeader(
             version=__version__,

@@ -41,7 +41,7 @@ from ortholoc_edge.adapters.messages import (
     fix_message,
     rejection_message,
 )
-from ortholoc_edge.errors import ConfigError, LinkError
+from ortholoc_edge.errors import ConfigError
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.rigid import Rigid3
@@ -502,9 +502,23 @@ def test_messages_are_as_the_schema_says() -> None:
 # -- endpoints, TLS and access control -----------------------------------------
 
 
-def test_endpoint_that_is_taken_is_named(bus: Bus, endpoint: str) -> None:
-    with pytest.raises(LinkError, match=r"127\.0\.0\.1.*\[bus\]"):
-        Bus(BusOptions(enabled=True, listen=(endpoint,)))
+def test_a_port_that_is_taken_is_named_and_waited_for(caplog: pytest.LogCaptureFixture) -> None:
+    """What died a second ago may still hold it, and a restart in flight must not end there."""
+    holder = socket.create_server(("127.0.0.1", 0))
+    endpoint = f"tcp/127.0.0.1:{holder.getsockname()[1]}"
+    bus = Bus(BusOptions(enabled=True, vehicle="owl", listen=(endpoint,)))
+    try:
+        assert re.search(r"127\.0\.0\.1.*\[bus\].*again and again", caplog.text)
+        bus.publish(a_message())
+        holder.close()
+        settings = {"connect/timeout_ms": 20_000, "connect/exit_on_failure": True}
+        session = listening(endpoint, **settings)
+        try:
+            assert published(session, "ortholoc/owl/fix", lambda: bus.publish(a_message()))
+        finally:
+            session.close()
+    finally:
+        bus.close()
 
 
 @pytest.mark.parametrize("options", [{"listen": ("nonsense",)}, {"listen": (), "connect": ("nonsense",)}])

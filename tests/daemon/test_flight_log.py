@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import re
 import resource
 import shutil
 import signal
@@ -31,7 +32,7 @@ from ortholoc_edge.adapters import flight_log as module
 from ortholoc_edge.adapters.flight_log import FlightLog, LogOptions
 from ortholoc_edge.bench.flight_log import log_files, read_frames, read_header
 from ortholoc_edge.cli import main
-from ortholoc_edge.errors import DatasetError, OrtholocError
+from ortholoc_edge.errors import DatasetError
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.frame import CameraMount, Frame, VehicleState
 from ortholoc_edge.pipeline.navigator import Circumstances
@@ -393,10 +394,20 @@ def test_a_defect_of_logging_ends_nothing(tmp_path: Path, caplog: pytest.LogCapt
     assert any(record.message == "flight log" for record in caplog.records)
 
 
-def test_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("in the way", encoding="utf-8")
-    with pytest.raises(OrtholocError, match=r"file.*log\.folder"):
-        made(tmp_path / "file" / "log")
+def test_a_folder_that_cannot_be_written_is_named_and_tried_again(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A restart in flight, on a card that went read-only, must still give the vehicle its position."""
+    obstacle = tmp_path / "file"
+    obstacle.write_text("in the way", encoding="utf-8")
+    log = made(obstacle / "log")
+    assert re.search(r"file.*log\.folder", caplog.text)
+    put(log, S)
+    wait_for(lambda: log.dropped == 1)
+    obstacle.unlink()
+    put(log, 3 * S)
+    log.close()
+    assert stamps(obstacle / "log") == [3 * S]
 
 
 def test_what_is_no_log_is_named(tmp_path: Path) -> None:

@@ -12,8 +12,8 @@ class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     Attributes:
         source: ``folder:PATH`` of pictures, ``video:PATH``, ``device:/dev/video0`` or ``device:0``, a
-            ``rtsp://``, ``http://`` or ``https://`` address, or ``gstreamer:PIPELINE`` that ends in
-            ``appsink``.
+            ``rtsp://``, ``http://`` or ``https://`` address, ``gstreamer:PIPELINE`` that ends in
+            ``appsink``, or ``zenoh:KEY`` of compressed pictures on the bus.
         rate_hz: of a folder; asked of a camera whose ``fps`` is not given.
         latency_ms: from the middle of the exposure until the driver hands the frame over. It is subtracted
             from the stamp of live sources; measure it, since at 20 m/s each 50 ms left out are a metre.

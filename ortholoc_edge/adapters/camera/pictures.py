@@ -31,6 +31,11 @@ def read_image(path: Path) -> ImageArray:
         data = path.read_bytes()
     except OSError as error:
         raise CameraError(f"picture {path} can't be read: {error.strerror}; check the path and its rights") from error
+    return decode_image(data, f"picture {path}", "copy it again from its source or take it out")
+
+
+def decode_image(data: bytes, name: str, remedy: str) -> ImageArray:
+    """An encoded picture, as `read_image`. Raises: CameraError, "NAME is unusable: DEFECT; REMEDY"."""
     defect = _defect(data)
     if defect is None:
         try:
@@ -42,9 +47,9 @@ def read_image(path: Path) -> ImageArray:
             defect = f"OpenCV can't decode it ({error.err})"
         else:
             if image is not None and image.size > 0:
-                return _frozen(image, f"picture {path}")
+                return _frozen(image, name)
             defect = "not a picture that OpenCV can decode"
-    raise CameraError(f"picture {path} is unusable: {defect}; copy it again from its source or take it out")
+    raise CameraError(f"{name} is unusable: {defect}; {remedy}")
 
 
 def rgb(image: Any, name: str) -> ImageArray:
@@ -69,7 +74,7 @@ def _frozen(image: Any, name: str) -> ImageArray:
 def _defect(data: bytes) -> str | None:
     """What is visibly wrong with an encoded picture, before anything decodes it; None if nothing is."""
     if not data:
-        return "the file is empty"
+        return "it is empty"
     if data.startswith(b"\xff\xd8"):
         return _jpeg_defect(data)
     if data.startswith(b"\x89PNG\r\n\x1a\n"):

@@ -1,0 +1,185 @@
+"""Pictures that another program publishes, over real zenoh sessions on loopback."""
+
+from __future__ import annotations
+
+import json
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import zenoh
+
+from ortholoc_edge.adapters.bus import Bus, BusOptions
+from ortholoc_edge.adapters.camera import BadFrameError, CameraOptions, EndOfFrames, open_source
+from ortholoc_edge.adapters.camera.zenoh_frames import ZenohFrames, unpack
+from ortholoc_edge.clock import SystemClock, wall_clock_ns
+from ortholoc_edge.errors import CameraError, ConfigError
+from ortholoc_edge.pipeline.frame import Frame
+
+MS = 1_000_000
+KEY = "field/cam/compressed"
+RED = np.zeros((48, 64, 3), np.uint8)
+RED[:, :, 0] = 250
+
+
+def jpeg(image: np.ndarray = RED) -> bytes:
+    return cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
+
+
+def ros(data: bytes, unix_ns: int, order: str = "<", frame_id: bytes = b"optical\0", form: bytes = b"jpeg\0") -> bytes:
+    """As a DDS writes it, padding included."""
+    out = (b"\x00\x01" if order == "<" else b"\x00\x00") + b"\x00\x00"
+    body = struct.pack(order + "iI", unix_ns // 10**9, unix_ns % 10**9)
+    for text in (frame_id, form):
+        body += struct.pack(order + "I", len(text)) + text
+        body += bytes(-len(body) % 4)
+    return out + body + struct.pack(order + "I", len(data)) + data
+
+
+class Camera:
+    """The other program, and the source that reads it."""
+
+    def __init__(self) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            endpoint = f"tcp/127.0.0.1:{server.getsockname()[1]}"
+        self.bus = Bus(BusOptions(listen=(endpoint,)), takes_pictures=True)
+        options = CameraOptions(source=f"zenoh:{KEY}", latency_ms=30.0)
+        self.source = open_source(options, SystemClock(), self.bus)
+        assert isinstance(self.source, ZenohFrames)
+        config = zenoh.Config()
+        for key, value in {
+            "mode": "client", "scouting/multicast/enabled": False, "connect/endpoints": [endpoint],
+        }.items():  # fmt: skip
+            config.insert_json5(key, json.dumps(value))
+        self.session = zenoh.open(config)
+        self.publisher = self.session.declare_publisher(KEY, congestion_control=zenoh.CongestionControl.BLOCK)
+        wait_for(lambda: self.publisher.matching_status.matching)
+
+    def publish(self, payload: bytes, attachment: Any = None) -> None:
+        self.publisher.put(payload, attachment=None if attachment is None else json.dumps(attachment).encode())
+
+    def read(self) -> Frame:
+        frame = self.source.read(5.0)
+        assert frame is not None, "no frame"
+        return frame
+
+    def close(self) -> None:
+        self.source.close()
+        self.session.close()
+        self.bus.close()
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + 10.0
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+@pytest.fixture(scope="module")
+def made() -> Iterator[Camera]:
+    camera = Camera()
+    yield camera
+    camera.close()
+
+
+@pytest.fixture
+def camera(made: Camera) -> Camera:
+    assert made.source.read(0.0) is None
+    return made
+
+
+def test_pictures_with_the_stamp_of_this_computer(camera: Camera) -> None:
+    stamp_ns = time.monotonic_ns() - 80 * MS
+    camera.publish(jpeg(), {"stamp_ns": stamp_ns, "name": "IMG_1"})
+    frame = camera.read()
+    assert (frame.stamp_ns, frame.name) == (stamp_ns, "IMG_1")
+    # Red stays red.
+    assert np.abs(frame.image.astype(int) - RED).max() < 12
+    assert not frame.image.flags.writeable
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_compressed_images_of_ros(camera: Camera, order: str) -> None:
+    exposed_ns = time.monotonic_ns() - 60 * MS
+    camera.publish(ros(jpeg(), exposed_ns + wall_clock_ns() - time.monotonic_ns(), order))
+    frame = camera.read()
+    assert abs(frame.stamp_ns - exposed_ns) < 5 * MS
+    assert frame.image.shape == RED.shape
+
+
+@pytest.mark.parametrize(
+    "attachment", [None, {"unix_ns": 12345}, {"stamp_ns": 10**18}, {"stamp_ns": -1}, {"other": 1}, {"stamp_ns": "now"}]
+)
+def test_without_a_time_that_can_be_arrival_counts_less_the_latency(camera: Camera, attachment: Any) -> None:
+    before, begun_ns = camera.source.restamped, time.monotonic_ns()
+    camera.publish(jpeg(), attachment)
+    stamp_ns = camera.read().stamp_ns
+    assert begun_ns <= stamp_ns + 30 * MS <= time.monotonic_ns()
+    assert camera.source.restamped == before + 1
+
+
+def test_the_newest_wins(camera: Camera) -> None:
+    before, begun_ns = camera.source.overwritten, time.monotonic_ns()
+    for number in range(3):
+        camera.publish(jpeg(), {"stamp_ns": begun_ns + number, "name": str(number)})
+    wait_for(lambda: camera.source.overwritten == before + 2)
+    assert camera.read().name == "2"
+    assert camera.source.read(0.0) is None
+
+
+@pytest.mark.parametrize(
+    "payload", [b"", b"hello", jpeg()[:-40], ros(jpeg()[:-40], 0), ros(jpeg(), 0)[:-10], b"\x00\x01\x00\x00\x00"]
+)
+def test_what_is_no_picture_is_one_bad_frame(camera: Camera, payload: bytes) -> None:
+    begun_ns = time.monotonic_ns()
+    camera.publish(payload)
+    with pytest.raises(BadFrameError, match="the program that publishes it") as caught:
+        camera.read()
+    assert begun_ns - 30 * MS <= caught.value.stamp_ns <= time.monotonic_ns()
+    camera.publish(jpeg(), {"name": "next"})
+    assert camera.read().name == "next"
+
+
+def test_a_picture_of_many_megabytes(camera: Camera) -> None:
+    """Twelve megapixels as a camera with little compression gives them; on a bus without a camera that is cut off."""
+    noise = np.random.default_rng(1).integers(0, 256, (1500, 1500, 3), np.uint8)
+    payload = cv2.imencode(".png", noise)[1].tobytes()
+    assert len(payload) > 4 << 20
+    camera.publish(payload)
+    assert np.array_equal(camera.read().image[:, :, ::-1], noise)
+
+
+def test_a_text_that_claims_gigabytes_is_refused() -> None:
+    hostile = b"\x00\x01\x00\x00" + struct.pack("<iII", 1, 1, 0xFFFFFFF0) + b"x" * 64
+    with pytest.raises(CameraError, match="CompressedImage"):
+        unpack(hostile)
+
+
+def test_needs_the_bus_and_a_key() -> None:
+    with pytest.raises(ConfigError, match=r"\[bus\] enabled = true"):
+        open_source(CameraOptions(source="zenoh:a/b"), SystemClock())
+    bus = Bus(BusOptions(listen=()), takes_pictures=True)
+    try:
+        with pytest.raises(ConfigError, match="a//b"):
+            open_source(CameraOptions(source="zenoh:a//b"), SystemClock(), bus)
+    finally:
+        bus.close()
+
+
+def test_closing_ends_a_read() -> None:
+    bus = Bus(BusOptions(listen=()), takes_pictures=True)
+    source = ZenohFrames(bus, KEY, SystemClock())
+    thread = threading.Timer(0.05, source.close)
+    thread.start()
+    with pytest.raises(EndOfFrames):
+        source.read(10.0)
+    thread.join()
+    bus.close()
+    source.close()
