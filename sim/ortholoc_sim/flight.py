@@ -214,7 +214,7 @@ class FlightReport:
 
 
 @dataclass(frozen=True, slots=True)
-class _Studio:
+class Studio:
     """What the drawing process needs to begin."""
 
     spec: WorldSpec
@@ -224,7 +224,7 @@ class _Studio:
     camera: Camera
 
 
-def _draw(studio: _Studio, pipe: Connection) -> None:
+def _draw(studio: Studio, pipe: Connection) -> None:
     """Main of the drawing process: poses come in, pictures go out, until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the flight, and the flight ends this process
     cv2.setNumThreads(1)
@@ -245,7 +245,7 @@ class SimulatedCamera:
     camera would drop it. The stamp is the moment that the picture shows.
     """
 
-    def __init__(self, studio: _Studio, pose_at: Callable[[int], Rigid3 | None], rate_hz: float, clock: Clock) -> None:
+    def __init__(self, studio: Studio, pose_at: Callable[[int], Rigid3 | None], rate_hz: float, clock: Clock) -> None:
         self._pose_at, self._clock = pose_at, clock
         self._period_ns = round(_S / rate_hz)
         self._due_ns: int | None = None
@@ -373,7 +373,7 @@ def run_flight(options: FlightOptions, under_test: UnderTest | None = None, cloc
     path = options.pack or demo_pack_path()
     pack = Pack.open(path)
     site, route = site_and_route(pack, options)
-    placement = _placement(pack, site, options.spec)
+    placed = placement(pack, site, options.spec)
     loop_holder: list[ClosedLoop] = []
 
     def pose_at(stamp_ns: int) -> Rigid3 | None:
@@ -383,7 +383,7 @@ def run_flight(options: FlightOptions, under_test: UnderTest | None = None, cloc
     failures: list[BaseException] = []
     stop = threading.Event()
     camera = SimulatedCamera(
-        _Studio(options.spec, options.epoch, placement, options.sensor, options.camera),
+        Studio(options.spec, options.epoch, placed, options.sensor, options.camera),
         pose_at, options.frame_rate_hz, clock,
     )  # fmt: skip
     port = UdpPort(options.autopilot.system_id)
@@ -410,7 +410,7 @@ def run_flight(options: FlightOptions, under_test: UnderTest | None = None, cloc
         loop_holder.append(loop)
         camera.roll(start_ns + round(_FIRST_FRAME_S * _S), end_ns)
         thread = threading.Thread(
-            target=_fly, args=(loop, port, clock, end_ns, stop, failures), name="simulated-aircraft", daemon=True
+            target=fly, args=(loop, port, clock, end_ns, stop, failures), name="simulated-aircraft", daemon=True
         )
         thread.start()
         try:
@@ -427,7 +427,7 @@ def run_flight(options: FlightOptions, under_test: UnderTest | None = None, cloc
     return make_report(loop, site, options, list(outcomes), camera.frames)
 
 
-def _fly(
+def fly(
     loop: ClosedLoop, port: UdpPort, clock: Clock, end_ns: int, stop: threading.Event, failures: list[BaseException]
 ) -> None:
     """The aircraft's thread: steps on time, messages as they come."""
@@ -469,7 +469,7 @@ def _along(points: FloatArray, step_m: float) -> FloatArray:
     return np.vstack(pieces)
 
 
-def _placement(pack: Pack, site: Site, spec: WorldSpec) -> Placement:
+def placement(pack: Pack, site: Site, spec: WorldSpec) -> Placement:
     west, south, east, north = layer_bounds(pack.manifest.dop)
     # A pack's rim lies on whole steps of its tiles.
     step_m = CROP_PX * pack.manifest.dop.gsd_m

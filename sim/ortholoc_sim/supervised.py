@@ -13,6 +13,7 @@ import resource
 import signal
 import socket
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -31,31 +32,34 @@ _POLL_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """Of a unit: times in s. ``for_good``: exit codes after which it is not started again."""
+    """Of a unit: times in s. ``for_good``: exit codes after which it is not started again. ``environment``: what it
+    sets, but for paths."""
 
     watchdog_s: float
     restart_s: float
     start_s: float
     stop_s: float
     for_good: frozenset[int]
+    environment: Mapping[str, str]
 
     @classmethod
-    def of_unit(cls, path: Path) -> Rules:
-        """Raises: ConfigError if the unit lacks one, or restarts for other reasons than these rules know."""
-        text = path.read_text(encoding="utf-8")
+    def of_unit(cls, text: str) -> Rules:
+        """Of the text of a unit. Raises: ConfigError if it lacks one, or restarts for other reasons than these know."""
 
         def value(key: str) -> str:
             found = re.search(rf"^{key}=(.+)$", text, re.MULTILINE)
             if found is None:
-                raise ConfigError(f"{path}: no {key}")
+                raise ConfigError(f"the unit has no {key}")
             return found[1]
 
         if value("Restart") != "on-failure" or value("StartLimitIntervalSec") != "0":
-            raise ConfigError(f"{path}: this supervisor knows Restart=on-failure without a limit only")
+            raise ConfigError("this supervisor knows Restart=on-failure without a limit only")
         codes = value("RestartPreventExitStatus").split()
+        pairs = [pair.partition("=") for line in re.findall(r"^Environment=(.+)$", text, re.M) for pair in line.split()]
         return cls(
             float(value("WatchdogSec")), float(value("RestartSec")), float(value("TimeoutStartSec")),
             float(value("TimeoutStopSec")), frozenset(int(code) for code in codes),
+            {name: setting for name, _, setting in pairs if "/" not in setting},
         )  # fmt: skip
 
 
@@ -107,13 +111,13 @@ class Supervisor:
             folder: for the socket and what the program says (``daemon.log``); its path must be short.
             environment: added to ours.
         """
-        self._command, self._rules, self._folder = list(command), rules, folder
+        self._command, self.rules, self._folder = list(command), rules, folder
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         address = folder / "notify"
         address.unlink(missing_ok=True)
         self._socket.bind(str(address))
         self._socket.settimeout(_POLL_S)
-        self._environment = {**os.environ, **environment, "NOTIFY_SOCKET": str(address)}
+        self._environment = {**os.environ, **rules.environment, **environment, "NOTIFY_SOCKET": str(address)}
         self._said = (folder / "daemon.log").open("ab")
         self.happenings: list[Happening] = []
         self.longest_pause_s = 0.0
@@ -134,9 +138,7 @@ class Supervisor:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.stop()
-        self._socket.close()
-        self._said.close()
+        self.close()
 
     @property
     def pid(self) -> int:
@@ -162,8 +164,14 @@ class Supervisor:
         path = self._folder / "daemon.log"
         return "\n".join(path.read_text(encoding="utf-8", errors="replace").splitlines()[-lines:])
 
-    def stop(self) -> int | None:
-        """SIGTERM, and SIGKILL where that is not obeyed in time; the exit code."""
+    def close(self) -> int | None:
+        """SIGTERM, and SIGKILL where that is not obeyed in time; the exit code. Idempotent."""
+        code = self._end()
+        self._socket.close()
+        self._said.close()
+        return code
+
+    def _end(self) -> int | None:
         self._over.set()
         if self._thread.is_alive():
             self._thread.join()
@@ -174,9 +182,9 @@ class Supervisor:
             process.send_signal(signal.SIGCONT)
             process.terminate()
             try:
-                process.wait(self._rules.stop_s)
+                process.wait(self.rules.stop_s)
             except subprocess.TimeoutExpired:
-                self._note("late", f"not ended {self._rules.stop_s:g} s after SIGTERM")
+                self._note("late", f"not ended {self.rules.stop_s:g} s after SIGTERM")
                 process.kill()
                 process.wait()
         return process.returncode
@@ -207,17 +215,17 @@ class Supervisor:
             elif code is not None:
                 self._note("ended", _cause(code))
                 self._is_ready = False
-                if code == 0 or code in self._rules.for_good:
+                if code == 0 or code in self.rules.for_good:
                     return
-                self._again_s = now_s + self._rules.restart_s
+                self._again_s = now_s + self.rules.restart_s
             elif self._kill_s is not None:
                 if now_s >= self._kill_s:
                     self._process.kill()
-                    self._kill_s = now_s + self._rules.stop_s
-            elif now_s - self._beat_s > (self._rules.watchdog_s if self._is_ready else self._rules.start_s):
+                    self._kill_s = now_s + self.rules.stop_s
+            elif now_s - self._beat_s > (self.rules.watchdog_s if self._is_ready else self.rules.start_s):
                 self._note("watchdog" if self._is_ready else "late", f"silent for {now_s - self._beat_s:.1f} s")
                 self._process.send_signal(signal.SIGABRT)
-                self._kill_s = now_s + self._rules.stop_s
+                self._kill_s = now_s + self.rules.stop_s
 
     def _listen(self) -> None:
         try:
@@ -242,15 +250,6 @@ def _cause(code: int) -> str:
 
 
 def daemon_command(config: Path) -> list[str]:
-    """The daemon of this environment. Raises: ConfigError if the program is not installed in it."""
-    import sys
-
+    """The daemon of this environment."""
     return [sys.executable, "-m", "ortholoc_edge", "run", "--config", str(config)]
 
-
-def unit_path() -> Path:
-    """The unit of this checkout, or the one that was installed with the package."""
-    return _UNIT
-
-
-_UNIT = Path(__file__).parents[2] / "systemd" / "ortholoc-edge.service"
