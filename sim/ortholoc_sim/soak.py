@@ -112,9 +112,9 @@ def soak(
         file = resources.enter_context((out / "soak.csv").open("w", newline="", encoding="utf-8"))
         table = csv.DictWriter(file, [field.name for field in fields(Moment)])
         table.writeheader()
-        while (elapsed_s := time.monotonic() - begun_s) < seconds:
+        while time.monotonic() - begun_s < seconds:
             rig.fly_until(begun_s + len(moments) * _EVERY_S)
-            moment = _look(rig, elapsed_s)
+            moment = _look(rig, time.monotonic() - begun_s)
             moments.append(moment)
             table.writerow(asdict(moment))
             file.flush()
