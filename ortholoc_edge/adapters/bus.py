@@ -389,6 +389,8 @@ def _session_config(options: BusOptions, credentials: Path | None, most_received
         # Without an end, and the flight does not wait for it.
         settings["connect/timeout_ms"] = -1
         settings["connect/exit_on_failure"] = False
+        # The camera's program may be what has to be found again: zenoh's own 4 s are 80 m of flight.
+        settings["connect/retry"] = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
     try:
         config = zenoh.Config() if options.config is None else zenoh.Config.from_file(options.config)
     except zenoh.ZError as err:

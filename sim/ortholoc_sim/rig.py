@@ -6,14 +6,18 @@ The aircraft circles a closed route without GNSS, steered by what its autopilot 
 
 from __future__ import annotations
 
+import contextlib
 import json
+import multiprocessing
 import shutil
+import signal
 import socket
 import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
+from multiprocessing.connection import Connection
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -99,16 +103,23 @@ class Rig:
         self._failures: list[BaseException] = []
         self._loop: ClosedLoop | None = None
         self._resources = ExitStack()
-        self._sockets = _free_ports(3)
+        self._settings = self.options.settings
+        self._camera_port, self._our_port, self._bus_port, self._page_port, self._router_port = free_ports(5)
 
     @property
     def bus_endpoint(self) -> str:
         """Where the daemon listens."""
-        return f"tcp/127.0.0.1:{self._sockets[1]}"
+        return f"tcp/127.0.0.1:{self._bus_port}"
 
     @property
-    def page_address(self) -> tuple[str, int]:
-        return "127.0.0.1", self._sockets[2]
+    def router_endpoint(self) -> str:
+        """Of a zenoh router that the daemon connects to where there is one."""
+        return f"tcp/127.0.0.1:{self._router_port}"
+
+    @property
+    def page_port(self) -> int:
+        """Of the ground page, on loopback."""
+        return self._page_port
 
     @property
     def config_path(self) -> Path:
@@ -151,12 +162,14 @@ class Rig:
         camera = SimulatedCamera(studio, pose_at, options.rate_hz, self._clock)
         resources.callback(camera.shut_down)
         port = resources.enter_context(closing(UdpPort(flight.autopilot.system_id)))
-        self._session = resources.enter_context(closing(_session(f"tcp/127.0.0.1:{self._sockets[0]}", "listen")))
-        publisher = self._session.declare_publisher(_KEY)
-        # The session is the camera's; what the daemon publishes comes over the same line.
+        self._session = resources.enter_context(closing(zenoh_session("peer", f"tcp/127.0.0.1:{self._our_port}")))
         self._session.declare_subscriber(f"ortholoc/{VEHICLE}/fix", self._on_fix)
         self._session.declare_subscriber(f"ortholoc/{VEHICLE}/rejection", self._on_rejection)
-        self._write_config(f"udpout:127.0.0.1:{port.port}")
+        self._link = f"udpout:127.0.0.1:{port.port}"
+        self._write_config()
+        self.camera_program = CameraProgram(f"tcp/127.0.0.1:{self._camera_port}", _KEY)
+        resources.callback(self.camera_program.kill)
+        self.camera_program.start()
         camera.wait_ready()
         start_ns = self._clock.now_ns()
         self._loop = ClosedLoop(
@@ -174,7 +187,7 @@ class Rig:
             threading.Thread(
                 target=fly, args=(self._loop, port, self._clock, end_ns, self._stop, self._failures), daemon=True
             ),
-            threading.Thread(target=self._film, args=(camera, publisher.put), name="rig-camera", daemon=True),
+            threading.Thread(target=self._film, args=(camera,), name="rig-camera", daemon=True),
         ]
         for thread in threads:
             thread.start()
@@ -197,8 +210,14 @@ class Rig:
         self.supervisor = self._supervisor()
         self.supervisor.__enter__()
 
-    def _write_config(self, link: str) -> None:
+    def reconfigure(self, settings: Mapping[str, Mapping[str, Any]]) -> None:
+        """Write another configuration; the daemon reads it when it starts."""
+        self._settings = settings
+        self._write_config()
+
+    def _write_config(self) -> None:
         camera = self.options.flight.camera
+        peers = (self._camera_port, self._our_port, self._router_port)
         tables: dict[str, dict[str, Any]] = {
             "camera": {"source": f"zenoh:{_KEY}"},
             "intrinsics": {
@@ -206,17 +225,17 @@ class Rig:
                 "cx": camera.cx, "cy": camera.cy, "distortion": list(camera.distortion),
             },
             "map": {"pack": str(self.pack_path)},
-            "link": {"endpoint": link},
+            "link": {"endpoint": self._link},
             # A machine that also draws the camera's pictures and flies the aircraft.
             "timing": {"max_age_ms": 3000.0},
             "log": {"folder": str(self.log_folder)},
             "bus": {
                 "enabled": True, "vehicle": VEHICLE, "listen": [self.bus_endpoint],
-                "connect": [f"tcp/127.0.0.1:{self._sockets[0]}"], "image_rate_hz": 1.0,
+                "connect": [f"tcp/127.0.0.1:{port}" for port in peers], "image_rate_hz": 1.0,
             },
-            "page": {"enabled": True, "listen": "{}:{}".format(*self.page_address)},
+            "page": {"enabled": True, "listen": f"127.0.0.1:{self._page_port}"},
         }  # fmt: skip
-        for name, given in self.options.settings.items():
+        for name, given in self._settings.items():
             tables[name] = {**tables.get(name, {}), **given}
         text = "".join(
             f"[{name}]\n" + "".join(f"{key} = {json.dumps(value)}\n" for key, value in table.items())
@@ -226,7 +245,7 @@ class Rig:
 
     # -- what happens in the air: each in a thread of its own ---------------------------------------------
 
-    def _film(self, camera: SimulatedCamera, put: Callable[..., None]) -> None:
+    def _film(self, camera: SimulatedCamera) -> None:
         while not self._stop.is_set():
             try:
                 frame = camera.read(0.2)
@@ -237,7 +256,7 @@ class Rig:
                 return
             if frame is not None and self.is_camera_plugged:
                 attachment = json.dumps({"stamp_ns": frame.stamp_ns, "name": frame.name}).encode()
-                put(_jpeg(frame.image), attachment=attachment)
+                self.camera_program.publish(_jpeg(frame.image), attachment)
 
     def _on_fix(self, sample: Any) -> None:
         at_s = time.monotonic()
@@ -302,18 +321,68 @@ def _jpeg(image: ImageArray) -> bytes:
     return cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), _JPEG)[1].tobytes()
 
 
-def _session(endpoint: str, how: str) -> Any:
+def zenoh_session(mode: str, listen: str | None = None, connect: str | None = None) -> Any:
+    """A session that finds nobody by itself."""
     import zenoh
 
     config = zenoh.Config()
-    for key, value in {"mode": "peer", "scouting/multicast/enabled": False, "listen/endpoints": [],
-                       f"{how}/endpoints": [endpoint]}.items():  # fmt: skip
+    settings: dict[str, Any] = {"mode": mode, "scouting/multicast/enabled": False}
+    settings["listen/endpoints"] = [] if listen is None else [listen]
+    settings["connect/endpoints"] = [] if connect is None else [connect]
+    if connect is not None:
+        settings["connect/timeout_ms"] = round(_PATIENCE_S * 1000)
+    for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return zenoh.open(config)
 
 
-def _free_ports(count: int) -> list[int]:
+def free_ports(count: int) -> list[int]:
+    """Ports that nobody listens on now."""
     with ExitStack() as held:
-        return [
-            held.enter_context(socket.create_server(("127.0.0.1", 0))).getsockname()[1] for _ in range(count)
-        ]
+        return [held.enter_context(socket.create_server(("127.0.0.1", 0))).getsockname()[1] for _ in range(count)]
+
+
+class CameraProgram:
+    """The program that has the camera, a process of its own: what it is given it publishes."""
+
+    def __init__(self, endpoint: str, key: str) -> None:
+        self._endpoint, self._key = endpoint, key
+        self._lock = threading.Lock()
+        self._pipe: Connection | None = None
+        self._process: Any = None
+
+    def start(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        pipe, theirs = context.Pipe()
+        process = context.Process(target=_publish, args=(self._endpoint, self._key, theirs), daemon=True)
+        process.start()
+        theirs.close()
+        with self._lock:
+            self._pipe, self._process = pipe, process
+
+    def publish(self, payload: bytes, attachment: bytes) -> None:
+        """Lost where the program does not run."""
+        with self._lock, contextlib.suppress(OSError):
+            if self._pipe is not None:
+                self._pipe.send((payload, attachment))
+
+    def kill(self) -> None:
+        """As the kernel does when memory runs out: SIGKILL."""
+        with self._lock:
+            pipe, process, self._pipe, self._process = self._pipe, self._process, None, None
+        if pipe is not None:
+            process.kill()
+            process.join()
+            pipe.close()
+
+
+def _publish(endpoint: str, key: str, pipe: Connection) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    session = zenoh_session("peer", endpoint)
+    publisher = session.declare_publisher(key)
+    try:
+        while True:
+            payload, attachment = pipe.recv()
+            publisher.put(payload, attachment=attachment)
+    except (EOFError, OSError):
+        session.close()

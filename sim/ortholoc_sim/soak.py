@@ -108,7 +108,7 @@ def soak(
         rig = resources.enter_context(Rig(out / "rig", options))
         rig.wait_for(lambda: rig.supervisor.is_ready, "READY=1")
         begun_s = time.monotonic()
-        resources.callback(_watched(rig.page_address[1]))
+        resources.callback(_watched(rig.page_port))
         file = resources.enter_context((out / "soak.csv").open("w", newline="", encoding="utf-8"))
         table = csv.DictWriter(file, [field.name for field in fields(Moment)])
         table.writeheader()

@@ -159,10 +159,13 @@ class Supervisor:
         """A signal to the program."""
         os.kill(self.pid, number)
 
+    def said(self) -> str:
+        """All that the program said in its present life and those before."""
+        return (self._folder / "daemon.log").read_text(encoding="utf-8", errors="replace")
+
     def tail(self, lines: int = 8) -> str:
-        """The last that the program said."""
-        path = self._folder / "daemon.log"
-        return "\n".join(path.read_text(encoding="utf-8", errors="replace").splitlines()[-lines:])
+        """The last of it."""
+        return "\n".join(self.said().splitlines()[-lines:])
 
     def close(self) -> int | None:
         """SIGTERM, and SIGKILL where that is not obeyed in time; the exit code. Idempotent."""
