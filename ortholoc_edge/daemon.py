@@ -19,6 +19,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
 
+from msgspec import structs
+
 from ortholoc_edge.adapters import systemd
 from ortholoc_edge.adapters.bus import Bus, bus_of
 from ortholoc_edge.adapters.camera import BadFrameError, EndOfFrames, FrameSource, open_source
@@ -500,10 +502,13 @@ def make_navigator(
 ) -> Navigator:
     """Localizer and tracker as configured; the caller closes the localizer."""
     fixed = config.mount.body_from_camera() if config.mount.gimbal_selection() is None else None
+    # A folder may hold a picture twice, and a video that was made for another rate does.
+    alive = not config.camera.source.startswith(("folder:", "video:"))
     return Navigator(
         Localizer(config.intrinsics.camera(), store, matcher, config.localizer, ladder),
         Tracker(store.pack.georeference, fixed, config.tracker, first_reset_counter, config.witness),
         budget_ms,
+        structs.replace(config.picture, refuse_repeated=config.picture.refuse_repeated and alive),
     )
 
 
