@@ -66,7 +66,8 @@ def test_a_device_that_does_as_it_is_told(shim: Path, tmp_path: Path) -> None:
     assert seen["settings"] == ["Made-up camera", "MJPG", 25.0, 5.0, 30]
     assert seen["differences"] == 0
     assert "truncated after" in seen["damaged"] and "end marker" in seen["damaged"]
-    assert seen["back"]["shape"] == [96, 128, 3] and seen["reconnects"] >= 1
+    assert seen["back"]["shape"] == [96, 128, 3] and seen["counts"]["reconnects"] >= 1
+    assert seen["counts"]["damaged"] >= 1 and seen["counts"]["frames"] > 8
     assert "stamps of exposure_start (as the driver says)" in log
     assert log.count("lost; trying again") == 1
 

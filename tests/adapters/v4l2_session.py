@@ -100,7 +100,7 @@ def well(device: Path) -> dict[str, object]:
     device.touch()
     seen["back"] = told(until(source, is_frame))
     seen["back_after_ms"] = (CLOCK.now_ns() - before) / 1e6
-    seen["reconnects"] = source.reconnects
+    seen["counts"] = source.counts()
     source.close()
     return seen
 

@@ -79,9 +79,21 @@ class DeviceSource:
         self.overwritten = 0
         self.reconnects = 0
         self.failed_grabs = 0
+        self.damaged = 0
         self._number = 0
         self._thread = threading.Thread(target=self._run, name="camera", daemon=True)
         self._thread.start()
+
+    def counts(self) -> dict[str, int]:
+        """Since the start: frames that came, that were damaged, and that a newer one replaced unread; grabs that
+        failed; how often it was opened again."""
+        return {
+            "frames": self._number,
+            "damaged": self.damaged,
+            "overwritten": self.overwritten,
+            "failed_grabs": self.failed_grabs,
+            "reconnects": self.reconnects,
+        }
 
     def read(self, timeout_s: float) -> Frame | None:
         """See `FrameSource.read`. The newest frame that was not read yet."""
@@ -162,6 +174,7 @@ class DeviceSource:
             self._number += 1
             latest: Frame | BadFrameError
             if shot.image is None:
+                self.damaged += 1
                 latest = BadFrameError(f"camera {self._name}: frame {name} is {shot.defect}", shot.stamp_ns, name)
             else:
                 latest = Frame(shot.stamp_ns, shot.image, name, shot.exposure_ns)

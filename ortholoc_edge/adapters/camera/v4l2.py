@@ -113,13 +113,18 @@ class Control:
             return None
         return bytes(buffer)
 
-    def settings(self) -> Settings:
-        """Raises: OSError."""
+    def settings(self) -> Settings | None:
+        """None of a device that does not tell its format so: one of several planes, or none that takes pictures.
+
+        Raises: OSError.
+        """
+        stream = self._ask(_G_FMT, struct.pack("=I", _CAPTURE))
+        if stream is None:
+            return None
         capability = self._ask(_QUERYCAP, b"") or bytes(104)
         formats: list[str] = []
         while (found := self._ask(_ENUM_FMT, struct.pack("=2I", len(formats), _CAPTURE))) is not None:
             formats.append(found[44:48].decode("ascii", "replace").rstrip())
-        stream = self._ask(_G_FMT, struct.pack("=I", _CAPTURE)) or bytes(208)
         width, height = struct.unpack_from("=2I", stream, 8)
         parameters = self._ask(_G_PARM, struct.pack("=I", _CAPTURE)) or bytes(204)
         numerator, denominator = struct.unpack_from("=2I", parameters, 12)
