@@ -103,7 +103,7 @@ def test_rtsp_gives_the_newest_frame_and_comes_back(
 def test_a_camera_that_goes_silent_is_opened_again(
     camera: RtspCamera, opened: Callable[..., DeviceSource], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stream, "_READ_TIMEOUT_MS", 400)
+    monkeypatch.setattr(stream, "_READ_TIMEOUT_MS", 200)
     source = opened(f"rtsp://pilot:hunter2@127.0.0.1:{camera.port}/live")
     frame_from(source)
     camera.silent.set()
