@@ -159,7 +159,7 @@ class Commander:
                 "age_ms": (now_ns - frame.stamp_ns) / 1e6,
                 "name": frame.name,
                 "outcome": outcome_record(outcome),
-                "step": None if step is None else frame_record(frame.name, True, *step),
+                "step": None if step is None else frame_record(frame.name, frame.exposure_ns, True, *step),
                 "statistics": self._statistics(),
             }
         )

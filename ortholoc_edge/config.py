@@ -22,6 +22,7 @@ from ortholoc_edge.adapters.flight_log import LogOptions
 from ortholoc_edge.adapters.mavlink import GimbalSelection, LinkOptions
 from ortholoc_edge.adapters.page.options import PageOptions
 from ortholoc_edge.adapters.page.options import refused as page_refused
+from ortholoc_edge.adapters.secret import LEFT_OUT, without_credentials
 from ortholoc_edge.errors import ConfigError
 from ortholoc_edge.geometry import frames, rotation
 from ortholoc_edge.geometry.arrays import FloatArray
@@ -31,6 +32,7 @@ from ortholoc_edge.matching.providers import ProviderName
 from ortholoc_edge.matching.types import STRUCTURAL
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
 from ortholoc_edge.pipeline.navigator import TimingOptions
+from ortholoc_edge.pipeline.picture import PictureOptions
 from ortholoc_edge.pipeline.tracker import TrackerOptions
 from ortholoc_edge.pipeline.witness import WitnessOptions
 
@@ -192,6 +194,7 @@ class Config(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     link: LinkOptions
     mount: MountOptions = field(default_factory=MountOptions)
     matcher: MatcherOptions = field(default_factory=MatcherOptions)
+    picture: PictureOptions = field(default_factory=PictureOptions)
     localizer: LocalizerOptions = field(default_factory=LocalizerOptions)
     tracker: TrackerOptions = field(default_factory=TrackerOptions)
     witness: WitnessOptions = field(default_factory=WitnessOptions)
@@ -242,24 +245,18 @@ def without_secrets(config: Config) -> dict[str, Any]:
 
 # In tables of any depth.
 _SECRET_KEYS = frozenset({"signing_key", "signing_state", "private_key", "token_file"})
-_LEFT_OUT = "(left out)"
-# rtsp://NAME:PASSWORD@HOST, and properties of GStreamer's sources.
-_IN_ADDRESS = re.compile(r"(://)[^/@\s]+@")
-_AS_PROPERTY = re.compile(
-    r'\b(user-id|user-pw|proxy-id|proxy-pw|password|passwd|token|secret)(\s*=\s*)("[^"]*"|\S+)'
-)
 
 
 def _masked(value: Any) -> Any:
     if isinstance(value, dict):
         return {
-            name: _LEFT_OUT if name in _SECRET_KEYS and part is not None else _masked(part)
+            name: LEFT_OUT if name in _SECRET_KEYS and part is not None else _masked(part)
             for name, part in value.items()
         }
     if isinstance(value, list):
         return [_masked(part) for part in value]
     if isinstance(value, str):
-        return _AS_PROPERTY.sub(rf"\1\2{_LEFT_OUT}", _IN_ADDRESS.sub(rf"\1{_LEFT_OUT}@", value))
+        return without_credentials(value)
     return value
 
 

@@ -19,9 +19,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
 
+from msgspec import structs
+
 from ortholoc_edge.adapters import systemd
 from ortholoc_edge.adapters.bus import Bus, bus_of
-from ortholoc_edge.adapters.camera import BadFrameError, EndOfFrames, FrameSource, open_source
+from ortholoc_edge.adapters.camera import BadFrameError, DeviceSource, EndOfFrames, FrameSource, open_source
 from ortholoc_edge.adapters.commands import Answer, BusyError, Desk
 from ortholoc_edge.adapters.flight_log import FlightLog
 from ortholoc_edge.adapters.mavlink import AutopilotLink, Statistic, SystemStatus
@@ -193,6 +195,7 @@ class Daemon:
                 self._counts,
                 self._commander,
                 replaced=lambda: self._slot.replaced,
+                camera=lambda: self._frames.counts() if isinstance(self._frames, DeviceSource) else {},
                 unix_minus_stamp_ns=self._unix_minus_stamp_ns,
                 bus=self._bus,
                 log=self._log,
@@ -500,10 +503,13 @@ def make_navigator(
 ) -> Navigator:
     """Localizer and tracker as configured; the caller closes the localizer."""
     fixed = config.mount.body_from_camera() if config.mount.gimbal_selection() is None else None
+    # A folder may hold a picture twice, and a video that was made for another rate does.
+    alive = not config.camera.source.startswith(("folder:", "video:"))
     return Navigator(
         Localizer(config.intrinsics.camera(), store, matcher, config.localizer, ladder),
         Tracker(store.pack.georeference, fixed, config.tracker, first_reset_counter, config.witness),
         budget_ms,
+        structs.replace(config.picture, refuse_repeated=config.picture.refuse_repeated and alive),
     )
 
 

@@ -21,6 +21,7 @@ import numpy as np
 
 from ortholoc_edge.adapters.bus import bus_of
 from ortholoc_edge.adapters.camera import BadFrameError, EndOfFrames, FrameSource, open_source
+from ortholoc_edge.adapters.camera.v4l2 import Settings, device_path, differences, read_settings
 from ortholoc_edge.adapters.computer import ComputerReader, ComputerStatus
 from ortholoc_edge.adapters.mavlink.audit import Finding, Level
 from ortholoc_edge.adapters.mavlink.options import parse_endpoint
@@ -47,6 +48,10 @@ _PIPELINE_MIB = 320
 _LOOK_S = 5.0
 _FRAMES_WANTED = 20
 _LEAST_RATE = 0.7
+# A frame that is older when it comes is old before anything is done with it.
+_OLD_MS = 150.0
+# Where frames are stamped on arrival.
+_STREAMS = ("rtsp", "http", "https")
 # Of 255 (field notes: darkness).
 _DARK = 12.0
 
@@ -67,7 +72,7 @@ def check_computer(config: Config, clock: Clock, environ: Mapping[str, str]) -> 
                     closed_last.callback(bus.close)
                 return open_source(config.camera, clock, bus)
 
-            seen = look(opened, clock)
+            seen = look(opened, clock, settings=_settings_of(config))
         pictures = [seen] if isinstance(seen, Finding) else check_look(config, seen)
     return [
         *check_clock(wall_clock_ns(), is_synchronised()),
@@ -150,7 +155,7 @@ def _devices(config: Config) -> list[tuple[str, Path]]:
     devices = []
     kind, _, rest = config.camera.source.partition(":")
     if kind == "device":
-        devices.append(("camera", Path(f"/dev/video{rest}" if rest.isdecimal() else rest)))
+        devices.append(("camera", Path(device_path(rest))))
     endpoint = parse_endpoint(config.link.endpoint)
     if endpoint.kind == "serial":
         devices.append(("link", Path(endpoint.address)))
@@ -321,6 +326,8 @@ class Look:
         alike: how many were, bit for bit, the one before.
         bad: how many could not be read.
         rate_hz: of those that came, by their stamps; None of fewer than three.
+        age_ms: by which they were late, the median; None without any.
+        settings: of a V4L2 device, while it ran.
     """
 
     sizes: tuple[tuple[int, int], ...]
@@ -328,15 +335,33 @@ class Look:
     alike: int
     bad: int
     rate_hz: float | None
+    age_ms: float | None = None
+    settings: Settings | None = None
 
 
-def look(opened: Callable[[], FrameSource], clock: Clock, seconds: float = _LOOK_S) -> Look | Finding:
-    """Take frames for a while. A finding where the source can't be opened."""
+def _settings_of(config: Config) -> Callable[[], Settings | None]:
+    kind, _, rest = config.camera.source.partition(":")
+    return (lambda: read_settings(device_path(rest))) if kind == "device" else lambda: None
+
+
+def look(
+    opened: Callable[[], FrameSource],
+    clock: Clock,
+    seconds: float = _LOOK_S,
+    settings: Callable[[], Settings | None] = lambda: None,
+) -> Look | Finding:
+    """Take frames for a while. A finding where the source can't be opened.
+
+    Args:
+        settings: asked for while the source runs.
+    """
     try:
         source = opened()
     except (CameraError, ConfigError, LinkError) as error:
         return _error("camera", error, "frames", "without it the daemon does not start")
     frames: list[Frame] = []
+    ages_ms: list[float] = []
+    now: Settings | None = None
     bad = 0
     end_ns = clock.now_ns() + round(seconds * _S)
     try:
@@ -350,9 +375,11 @@ def look(opened: Callable[[], FrameSource], clock: Clock, seconds: float = _LOOK
                 break
             if frame is not None:
                 frames.append(frame)
+                ages_ms.append((clock.now_ns() - frame.stamp_ns) / 1e6)
             else:
                 # A source that returns at once must not make this a busy loop.
                 time.sleep(0.01)
+        now = settings()
     except CameraError as error:
         return _error("camera", error, "frames", "it broke off while it was looked at")
     finally:
@@ -364,6 +391,8 @@ def look(opened: Callable[[], FrameSource], clock: Clock, seconds: float = _LOOK
         sum(np.array_equal(a.image, b.image) for a, b in pairwise(frames)),
         bad,
         (len(frames) - 1) * _S / span_ns if span_ns > 0 else None,
+        float(np.median(ages_ms)) if ages_ms else None,
+        now,
     )
 
 
@@ -412,11 +441,57 @@ def check_look(config: Config, seen: Look) -> list[Finding]:
                 "sensors have noise, so it is frozen", "unplug it and plug it in again; change its driver or cable",
             )
         )  # fmt: skip
+    found += [*_check_time(config, seen), *_check_settings(config, seen)]
     if seen.bad:
         found.append(
             Finding(
                 Level.WARNING, "camera", f"{seen.bad} of {seen.bad + len(seen.sizes)} frames can't be read", "all",
                 "they are refused", "another cable or hub; lower the rate",
+            )
+        )  # fmt: skip
+    return found
+
+
+def _check_time(config: Config, seen: Look) -> list[Finding]:
+    """Stamps are of the exposure, and not long ago."""
+    kind = config.camera.source.partition(":")[0]
+    if kind in _STREAMS and config.camera.latency_ms == 0:
+        return [
+            Finding(
+                Level.WARNING, "camera", "latency_ms = 0 of a stream", "what it is late by",
+                "frames are stamped when they arrive, and 50 ms left out are a metre at 20 m/s",
+                "measure it (docs/cameras.md) and write it into [camera] latency_ms",
+            )
+        ]  # fmt: skip
+    if kind not in ("folder", "video") and seen.age_ms is not None and seen.age_ms > _OLD_MS:
+        return [
+            Finding(
+                Level.WARNING, "camera", f"frames are {seen.age_ms:.0f} ms old when they come", f"{_OLD_MS:.0f} ms",
+                "each fix is that much later; autopilots take 250 ms in all",
+                "a wired camera instead of a stream; a lower resolution; see that nothing queues frames",
+            )
+        ]  # fmt: skip
+    return []
+
+
+def _check_settings(config: Config, seen: Look) -> list[Finding]:
+    """A device does as it was told."""
+    now = seen.settings
+    if now is None:
+        return []
+    why = "it may not have it, or another program changed it"
+    # The size is told from the frames themselves, and their rate from their stamps.
+    found = [
+        Finding(Level.WARNING, "camera", f"{one.what} {one.got}", one.wanted, why, one.remedy)
+        for one in differences(config.camera, now)
+        if one.what not in ("width", "height", "rate") or (one.what == "rate" and seen.rate_hz is None)
+    ]
+    if now.automatic and config.camera.exposure_ms is None:
+        found.append(
+            Finding(
+                Level.NOTE, "camera", "exposure is automatic", "a fixed one, of 2 to 5 ms by day",
+                "in dim light it gets long: frames are smeared, fewer, and nobody knows by how much",
+                'write [camera] exposure_ms, and gain; or "auto" to have it so',
             )
         )  # fmt: skip
     return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 from ortholoc_edge.adapters import systemd
@@ -64,6 +64,7 @@ class Reporter:
         commander: Commander,
         *,
         replaced: Callable[[], int],
+        camera: Callable[[], Mapping[str, int]],
         unix_minus_stamp_ns: Callable[[], int],
         bus: Bus | None = None,
         log: FlightLog | None = None,
@@ -76,13 +77,14 @@ class Reporter:
             counts: the daemon's, to which ours are added.
             commander: its `Commander.paused` is told.
             replaced: how many frames a newer one took the place of.
+            camera: what a live camera counts, `DeviceSource.counts`.
             unix_minus_stamp_ns: what makes dates of stamps, now.
             on_outcome: told of every outcome; must return at once.
         """
         self._link, self._vehicle, self._navigator, self._store = link, vehicle, navigator, store
         self._options, self._counts = options, counts
         self._bus, self._log, self._page, self._on_outcome = bus, log, page, on_outcome
-        self._commander, self._replaced = commander, replaced
+        self._commander, self._replaced, self._camera = commander, replaced, camera
         self._unix_minus_stamp_ns = unix_minus_stamp_ns
         self._started_ns: int | None = None
         # For systemd's status line.
@@ -100,8 +102,9 @@ class Reporter:
         self._origin_told_ns: int | None = None
 
     def statistics(self) -> dict[str, Statistic]:
-        """Counters since the start: the daemon's, the log's and the bus's drops, and the link's under ``link.``;
-        the rung of detail that frames are localized at, and whether GNSS agrees with the fixes."""
+        """Counters since the start: the daemon's, the log's and the bus's drops, the link's under ``link.`` and a
+        live camera's under ``camera.``; the rung of detail that frames are localized at, and whether GNSS agrees with
+        the fixes."""
         witness = self._navigator.tracker.witness.report
         return {
             **self._counts,
@@ -115,6 +118,7 @@ class Reporter:
             "bus_dropped": 0 if self._bus is None else self._bus.dropped,
             "commands_refused": 0 if self._bus is None else self._bus.refused,
             "page_dropped": 0 if self._page is None else self._page.dropped,
+            **{f"camera.{name}": value for name, value in self._camera().items()},
             **{f"link.{name}": value for name, value in self._link.statistics().items()},
         }
 

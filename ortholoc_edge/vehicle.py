@@ -98,6 +98,8 @@ class Vehicle:
             self._gimbal_mount(known),
             trouble or "",
             self._believed_position(known),
+            known.velocity_ned,
+            known.turning_rad_s,
         )
 
     def _believed_position(self, known: AutopilotState) -> FloatArray | None:

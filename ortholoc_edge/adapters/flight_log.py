@@ -121,6 +121,7 @@ class _Entry:
     """A frame on its way to the disk; ``picture`` is what is kept of it: grey, or small, or nothing."""
 
     name: str
+    exposure_ns: int | None
     picture: ImageArray | None
     outcome: Outcome
     step: LoggedStep | None
@@ -201,8 +202,10 @@ class FlightLog:
             outcome: as published.
             step: None where it was not localized.
         """
-        name, picture = ("", None) if frame is None else (frame.name, self._kept(frame.image))
-        self._hand_over(_Entry(name, picture, outcome, step))
+        name, exposure_ns, picture = (
+            ("", None, None) if frame is None else (frame.name, frame.exposure_ns, self._kept(frame.image))
+        )
+        self._hand_over(_Entry(name, exposure_ns, picture, outcome, step))
 
     def note(self, stamp_ns: int, statistics: Mapping[str, Any]) -> None:
         """Hand over the counters; returns at once."""
@@ -302,7 +305,8 @@ class FlightLog:
         if entry.picture is not None:
             file.add("camera", unix_ns, _image_message(entry.picture, whole, unix_ns))
         if entry.step is not None:
-            file.add("frame", unix_ns, msgspec.json.encode(frame_record(entry.name, whole, *entry.step)))
+            record = frame_record(entry.name, entry.exposure_ns, whole, *entry.step)
+            file.add("frame", unix_ns, msgspec.json.encode(record))
 
     def _location(self, fix: Fix, unix_ns: int) -> bytes:
         place = self._georeference.geodetic_from_map(fix.map_from_camera.translation)

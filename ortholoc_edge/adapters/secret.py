@@ -1,12 +1,25 @@
-"""Secrets from files: a path, or the name of a systemd credential."""
+"""Secrets: read from files (a path, or the name of a systemd credential), and left out of what others read."""
 
 from __future__ import annotations
 
+import re
 import stat
 from collections.abc import Mapping
 from pathlib import Path
 
 from ortholoc_edge.errors import ConfigError
+
+LEFT_OUT = "(left out)"
+# rtsp://NAME:PASSWORD@HOST, and properties of GStreamer's sources. A password may hold an @, and no / unless escaped.
+_IN_ADDRESS = re.compile(r"(://)[^/\s]+@")
+_AS_PROPERTY = re.compile(
+    r'\b(user-id|user-pw|proxy-id|proxy-pw|password|passwd|token|secret)(\s*=\s*)("[^"]*"|\S+)'
+)
+
+
+def without_credentials(text: str) -> str:
+    """An address or a GStreamer pipeline, for others to read."""
+    return _AS_PROPERTY.sub(rf"\1\2{LEFT_OUT}", _IN_ADDRESS.sub(rf"\1{LEFT_OUT}@", text))
 
 
 def read_secret(name: str, environ: Mapping[str, str], key: str) -> tuple[Path, bytes]:

@@ -26,7 +26,7 @@ from ortholoc_edge.adapters.flight_log import CAMERA_TOPIC, FRAME_TOPIC, HEADER_
 from ortholoc_edge.errors import DatasetError
 from ortholoc_edge.geometry.arrays import ImageArray
 from ortholoc_edge.pipeline.frame import Frame
-from ortholoc_edge.pipeline.navigator import Navigator, localize_again
+from ortholoc_edge.pipeline.navigator import Navigator
 from ortholoc_edge.pipeline.outcome import Outcome
 from ortholoc_edge.pipeline.record import FrameRecord, outcome_record
 
@@ -202,12 +202,12 @@ def repeat(logged: Iterable[LoggedFrame], navigator: Navigator) -> Iterator[Repe
         image = one.image if one.image is not None else np.zeros((0, 0), np.uint8) if was.prior is None else None
         now: Outcome | None = None
         if image is not None:
-            frame = Frame(record.stamp_ns, image, record.name)
+            frame = Frame(record.stamp_ns, image, record.name, record.exposure_ns)
             if complete:
                 now = navigator.step_again(frame, record.state(), was)
                 expected += 1
             else:
-                now = localize_again(navigator.localizer, frame, was)
+                now = navigator.localize_again(frame, record.state(), was)
         if now is None:
             yield None
         else:

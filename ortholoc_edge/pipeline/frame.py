@@ -16,11 +16,13 @@ class Frame:
         stamp_ns: middle of the exposure, monotonic clock.
         image: (H, W) grey or (H, W, 3) RGB, uint8.
         name: file name or running number, for logs and results.
+        exposure_ns: how long each row was exposed; None where that is not known.
     """
 
     stamp_ns: int
     image: ImageArray
     name: str
+    exposure_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,6 +55,8 @@ class VehicleState:
         position_sigma_m: 1-sigma of that position, horizontal (per axis) and vertical.
         believed_map_m: (3,) where the autopilot believes to be, whatever that comes from. It holds our own fixes, so it
             confirms nothing; but where nothing else says where to look, it does. None where it has no idea.
+        velocity_ned_m_s: (3,), true north; None where that is not known.
+        turning_rad_s: (3,) angular velocity of the body about its own axes; None where that is not known.
         no_attitude_because: in words, where that is known; empty otherwise.
         mount: of a camera in a gimbal, as it was at the stamp; None of a fixed one, which the tracker knows, and
             where nothing is known of the gimbal.
@@ -68,3 +72,5 @@ class VehicleState:
     mount: CameraMount | None = None
     no_attitude_because: str = ""
     believed_map_m: FloatArray | None = None
+    velocity_ned_m_s: FloatArray | None = None
+    turning_rad_s: FloatArray | None = None

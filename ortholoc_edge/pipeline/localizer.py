@@ -210,6 +210,17 @@ class Localizer:
         """In how many ways, of less and less detail, a frame can be localized."""
         return max(len(self._tracking), 1)
 
+    @property
+    def working_camera(self) -> Camera:
+        """Of the size at which frames are matched, without distortion."""
+        return self._working
+
+    def height_above_ground_m(self, prior: PosePrior) -> float | None:
+        """Of the predicted camera over the surface around it; None where the map has none."""
+        position = prior.map_from_camera.translation
+        ground_m = self._store.ground_near(position[:2], _GROUND_GSD_M)
+        return None if ground_m is None else float(position[2]) - ground_m
+
     def localize(
         self,
         frame: Frame,

@@ -13,6 +13,7 @@ from ortholoc_edge.pipeline.gate import GateOptions
 from ortholoc_edge.pipeline.ladder import Ladder
 from ortholoc_edge.pipeline.localizer import Localizer
 from ortholoc_edge.pipeline.outcome import Outcome, Rejected
+from ortholoc_edge.pipeline.picture import PictureOptions, Seen, Watch, grey_rows, motion_px_s, unfit
 from ortholoc_edge.pipeline.prior import PosePrior
 from ortholoc_edge.pipeline.tracker import Order, Tracker, TrackerOptions
 from ortholoc_edge.pipeline.witness import WitnessOptions
@@ -51,6 +52,7 @@ class Circumstances:
         reset_counter: the tracker's before the step; others may raise it between steps.
         orders: what the tracker was told since the step before.
         tuning: options that are no longer those of the start; None while they are.
+        repeats: how many frames just before showed the same picture.
     """
 
     number: int
@@ -60,6 +62,7 @@ class Circumstances:
     reset_counter: int
     orders: tuple[Order, ...] = ()
     tuning: Tuning | None = None
+    repeats: int = 0
 
 
 class Navigator:
@@ -71,14 +74,23 @@ class Navigator:
         last: what the last step depended on; None before the first.
     """
 
-    def __init__(self, localizer: Localizer, tracker: Tracker, budget_ms: float | None = None) -> None:
+    def __init__(
+        self,
+        localizer: Localizer,
+        tracker: Tracker,
+        budget_ms: float | None = None,
+        picture: PictureOptions | None = None,
+    ) -> None:
         """
         Args:
             budget_ms: wall time that a frame may take before detail is left out; None: any, so that a replay gives
                 the same on every machine.
+            picture: what a frame must be to be matched; None: anything, as photos of a recorded sequence are.
         """
         self.localizer = localizer
         self.tracker = tracker
+        self._picture = picture
+        self._watch = Watch()
         self.ladder = Ladder(localizer.rungs, budget_ms)
         self.last: Circumstances | None = None
         self._steps = 0
@@ -115,16 +127,39 @@ class Navigator:
         if was.tuning is not None and was.tuning != self._tuning:
             self.retune(was.tuning)
         self._orders = list(was.orders)
-        return self._step(frame, state, _yes(was.proceeded), was.rung)
+        return self._step(frame, state, _yes(was.proceeded), was.rung, was.repeats)
 
-    def _step(self, frame: Frame, state: VehicleState, proceed: Callable[[], bool], rung: int) -> Outcome:
+    def localize_again(self, frame: Frame, state: VehicleState, was: Circumstances) -> Outcome | None:
+        """A recorded step without those before it, from the prediction that it had; None if it had none."""
+        if was.prior is None:
+            return None
+        if was.tuning is not None:
+            self.localizer.retune(was.tuning.gate)
+        seen = self._see(frame, was.repeats)
+        return self._localize(frame, state, was.prior, seen, _yes(was.proceeded), was.rung)
+
+    def _step(
+        self,
+        frame: Frame,
+        state: VehicleState,
+        proceed: Callable[[], bool],
+        rung: int,
+        repeats: int | None = None,
+    ) -> Outcome:
+        """``repeats``: as recorded; None: they are counted."""
         orders, self._orders = tuple(self._orders), []
+        seen = self._see(frame, repeats)
         try:
-            return self._ordered(orders, frame, state, proceed, rung)
+            return self._ordered(orders, frame, state, proceed, rung, seen)
         except BaseException:
             # The step is in no log; with the next one they will be, and take effect again.
             self._orders = [*orders, *self._orders]
             raise
+
+    def _see(self, frame: Frame, repeats: int | None) -> Seen:
+        if self._picture is None:
+            return Seen(None, 0)
+        return self._watch.see(frame.image) if repeats is None else Seen(grey_rows(frame.image), repeats)
 
     def _ordered(
         self,
@@ -133,6 +168,7 @@ class Navigator:
         state: VehicleState,
         proceed: Callable[[], bool],
         rung: int,
+        seen: Seen,
     ) -> Outcome:
         number, reset_counter, proceeded = self._steps, self.tracker.reset_counter, 0
         self._steps += 1
@@ -150,19 +186,37 @@ class Navigator:
         if isinstance(predicted, Rejected):
             prior, outcome = None, predicted
         else:
-            prior, outcome = predicted, self.localizer.localize(frame, predicted, counted, rung)
-        self.last = Circumstances(number, prior, rung, proceeded, reset_counter, orders, self._tuning)
+            prior, outcome = predicted, self._localize(frame, state, predicted, seen, counted, rung)
+        self.last = Circumstances(number, prior, rung, proceeded, reset_counter, orders, self._tuning, seen.repeats)
         self.tracker.update(outcome, state)
         return outcome
 
+    def _localize(
+        self,
+        frame: Frame,
+        state: VehicleState,
+        prior: PosePrior,
+        seen: Seen,
+        proceed: Callable[[], bool],
+        rung: int,
+    ) -> Outcome:
+        """What the frame comes to where it is fit to be matched."""
+        if self._picture is not None:
+            refused = unfit(frame, seen, self._smear_px(frame, state, prior), self._picture)
+            if refused is not None:
+                return refused
+        return self.localizer.localize(frame, prior, proceed, rung)
 
-def localize_again(localizer: Localizer, frame: Frame, was: Circumstances) -> Outcome | None:
-    """A recorded step without those before it, from the prediction that it had; None if it had none."""
-    if was.prior is None:
-        return None
-    if was.tuning is not None:
-        localizer.retune(was.tuning.gate)
-    return localizer.localize(frame, was.prior, _yes(was.proceeded), was.rung)
+    def _smear_px(self, frame: Frame, state: VehicleState, prior: PosePrior) -> float | None:
+        """How far the ground is predicted to move in the picture while the shutter is open."""
+        mount = self.tracker.mount(state)
+        if frame.exposure_ns is None or mount is None:
+            return None
+        height_m = self.localizer.height_above_ground_m(prior)
+        if height_m is None:
+            return None
+        motion = motion_px_s(self.localizer.working_camera, height_m, state, mount)
+        return None if motion is None else motion * frame.exposure_ns * 1e-9
 
 
 def _yes(times: int) -> Callable[[], bool]:

@@ -15,6 +15,10 @@ class Reason(StrEnum):
     """Why a frame gave no fix."""
 
     BAD_FRAME = "bad_frame"  # truncated, empty, or of another size than the camera's
+    DARK = "dark"
+    REPEATED = "repeated"  # bit for bit the picture of the frame before, under another stamp
+    FROZEN = "frozen"  # again and again
+    MOTION_BLUR = "motion_blur"  # predicted: the ground moved too far while the shutter was open
     NO_PRIOR = "no_prior"  # nothing says where to look
     BAD_ATTITUDE = "bad_attitude"  # NaN or missing attitude from the autopilot
     GIMBAL_UNKNOWN = "gimbal_unknown"  # nothing says where the gimbal looked at the exposure

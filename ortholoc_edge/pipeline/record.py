@@ -90,11 +90,13 @@ class FrameRecord(Struct, frozen=True, kw_only=True):
     not finite.
 
     Attributes:
-        number: `Circumstances.number`.
+        number, repeats: as of `Circumstances`.
+        exposure_ns: as of `Frame`.
         whole: whether the picture beside it is without loss.
         mount: the gimbal's ``body_from_camera`` as (3, 4) and its sigmas; None of a fixed one.
         outcome: `outcome_record`, before its age was looked at.
-        orders, tuning: `Circumstances.orders` and ``tuning``; logs of older versions have none.
+        orders, tuning: `Circumstances.orders` and ``tuning``; logs of older versions have none, nor have they
+            velocity, turning, exposure and repeats.
     """
 
     number: int
@@ -118,6 +120,10 @@ class FrameRecord(Struct, frozen=True, kw_only=True):
     outcome: dict[str, Any]
     orders: tuple[Order, ...] = ()
     tuning: Tuning | None = None
+    velocity_ned_m_s: list[float | None] | None = None
+    turning_rad_s: list[float | None] | None = None
+    exposure_ns: int | None = None
+    repeats: int = 0
 
     def state(self) -> VehicleState:
         return VehicleState(
@@ -131,6 +137,8 @@ class FrameRecord(Struct, frozen=True, kw_only=True):
             None if self.mount is None else CameraMount(_rigid(self.mount[0]), (self.mount[1][0], self.mount[1][1])),
             self.no_attitude_because,
             None if self.believed_map_m is None else _floats(self.believed_map_m),
+            None if self.velocity_ned_m_s is None else _floats(self.velocity_ned_m_s),
+            None if self.turning_rad_s is None else _floats(self.turning_rad_s),
         )
 
     def circumstances(self) -> Circumstances:
@@ -138,14 +146,19 @@ class FrameRecord(Struct, frozen=True, kw_only=True):
         if self.prior_map_from_camera is not None and self.prior_covariance is not None:
             prior = PosePrior(_rigid(self.prior_map_from_camera), _floats(self.prior_covariance))
         return Circumstances(
-            self.number, prior, self.rung, self.proceeded, self.reset_counter, self.orders, self.tuning
+            self.number, prior, self.rung, self.proceeded, self.reset_counter, self.orders, self.tuning, self.repeats
         )
 
 
 def frame_record(
-    name: str, whole: bool, outcome: Outcome, state: VehicleState, circumstances: Circumstances
+    name: str,
+    exposure_ns: int | None,
+    whole: bool,
+    outcome: Outcome,
+    state: VehicleState,
+    circumstances: Circumstances,
 ) -> FrameRecord:
-    """What `Navigator.step_again` needs."""
+    """What `Navigator.step_again` needs. ``name`` and ``exposure_ns`` are the frame's."""
     prior, mount = circumstances.prior, state.mount
     return FrameRecord(
         number=circumstances.number,
@@ -169,6 +182,10 @@ def frame_record(
         outcome=outcome_record(outcome),
         orders=circumstances.orders,
         tuning=circumstances.tuning,
+        velocity_ned_m_s=None if state.velocity_ned_m_s is None else state.velocity_ned_m_s.tolist(),
+        turning_rad_s=None if state.turning_rad_s is None else state.turning_rad_s.tolist(),
+        exposure_ns=exposure_ns,
+        repeats=circumstances.repeats,
     )
 
 

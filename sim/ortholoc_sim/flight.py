@@ -342,7 +342,7 @@ def daemon_under_test(
     def prepare(bench: Bench) -> Callable[[], None]:
         camera = bench.camera
         config = Config(
-            camera=CameraOptions(source="folder:unused"),
+            camera=CameraOptions(source="device:unused"),
             intrinsics=Intrinsics(
                 width_px=camera.width, height_px=camera.height, fx=camera.fx, fy=camera.fy, cx=camera.cx,
                 cy=camera.cy, distortion=camera.distortion,

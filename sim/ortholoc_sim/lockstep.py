@@ -174,7 +174,7 @@ class _Camera:
         truth = self._flight.true_pose(stamp_ns)
         image = self._image(stamp_ns, number)
         image.flags.writeable = False
-        frame = Frame(stamp_ns, image, f"{number:05d}")
+        frame = Frame(stamp_ns, image, f"{number:05d}", round(self._table.exposure_ms * _MS))
         there_ns = stamp_ns + round(self._table.delay_ms * _MS)
         late = self._flight.fault("frames_late", stamp_ns)
         if late is not None and late.amount is not None:
@@ -469,7 +469,7 @@ class _Flight:
     def _config(self) -> Config:
         scenario = self.scenario
         return Config(
-            camera=CameraOptions(source="folder:unused"),
+            camera=CameraOptions(source="device:unused"),
             intrinsics=scenario.camera.intrinsics(),
             map=MapOptions(pack=str(self._pack)),
             link=scenario.link,

@@ -372,13 +372,6 @@ def test_unknown_source_is_a_config_error(text):
         open_source(CameraOptions(source=text), ManualClock())
 
 
-def test_gstreamer_absent_from_this_opencv_is_said():
-    if cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER):
-        pytest.skip("this OpenCV has GStreamer")
-    with pytest.raises(CameraError, match="without GStreamer"):
-        open_source(CameraOptions(source="gstreamer:videotestsrc ! appsink"), ManualClock())
-
-
 @pytest.mark.parametrize(
     "document",
     [

@@ -17,6 +17,7 @@ from replay import rendered
 
 from ortholoc_edge import preflight
 from ortholoc_edge.adapters.camera import BadFrameError, EndOfFrames, open_source
+from ortholoc_edge.adapters.camera.v4l2 import Settings
 from ortholoc_edge.adapters.computer import ComputerStatus
 from ortholoc_edge.adapters.mavlink.audit import Finding, Level
 from ortholoc_edge.cli import EXIT_CONFIG, EXIT_FAILED, main
@@ -192,7 +193,8 @@ def test_what_comes_of_looking() -> None:
         Frame(0, image, "0"), BadFrameError("cut", 1, "1"), None, Frame(S, image, "2"), Frame(2 * S, image, "3")
     )
     seen = preflight.look(lambda: camera, SystemClock())
-    assert seen == Look(((6, 4),) * 3, (7.0,) * 3, 2, 1, 1.0)
+    assert isinstance(seen, Look) and seen.age_ms is not None
+    assert dataclasses.replace(seen, age_ms=None) == Look(((6, 4),) * 3, (7.0,) * 3, 2, 1, 1.0)
     assert camera.closed
     broken = preflight.look(lambda: Camera(CameraError("gone; plug it in")), SystemClock())
     assert isinstance(broken, Finding) and broken.remedy == "plug it in"
@@ -213,6 +215,33 @@ def test_a_camera_that_gives_nothing_dark_frozen_slow_or_other_frames(good: Conf
     assert subjects(Look((size,) * 3, (90.0,) * 3, 2, 0, 29.0), good) == [], "a folder may have one picture twice"
     assert subjects(Look(((6, 4),), (90.0,), 0, 0, None)) == ["frames of 6 x 4 px"]
     assert subjects(Look((size,), (90.0,), 0, 3, None)) == ["3 of 4 frames can't be read"]
+
+
+def test_a_camera_that_is_late_or_does_not_do_as_it_was_told(good: Config) -> None:
+    size = good.intrinsics.width_px, good.intrinsics.height_px
+    well = Look((size,) * 3, (90.0,) * 3, 0, 0, 30.0, 40.0)
+
+    def found(seen: Look, **camera: Any) -> list[str]:
+        findings = preflight.check_look(with_(good, camera={"fps": 30.0, **camera}), seen)
+        assert all(finding.remedy and finding.why and finding.wanted for finding in findings)
+        return [f"{finding.level} {finding.found}" for finding in findings]
+
+    assert found(well, source="device:0") == []
+    late = dataclasses.replace(well, age_ms=180.0)
+    assert found(late, source="device:0") == ["warning frames are 180 ms old when they come"]
+    assert found(late, source="folder:x") == []
+    assert found(well, source="rtsp://10.0.0.2/live") == ["warning latency_ms = 0 of a stream"]
+    assert found(well, source="rtsp://10.0.0.2/live", latency_ms=120.0) == []
+    settings = Settings("x", ("YUYV",), "YUYV", *size, 30.0, 33.0, (0.1, 33.0), False, 3, (0, 9))
+    set_so = dataclasses.replace(well, settings=settings)
+    assert found(set_so, source="device:0", format="MJPG", exposure_ms=4.0) == [
+        "warning format YUYV", "warning exposure 33 ms"
+    ]  # fmt: skip
+    by_itself = dataclasses.replace(
+        well, settings=dataclasses.replace(settings, automatic=True, exposure_ms=None)
+    )
+    assert found(by_itself, source="device:0") == ["note exposure is automatic"]
+    assert found(by_itself, source="device:0", exposure_ms="auto") == []
 
 
 # -- the command ---------------------------------------------------------------

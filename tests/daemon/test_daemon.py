@@ -700,7 +700,7 @@ class _BrokenMatcher:
 def test_bug_is_counted_and_then_ends_the_process(tmp_path: Path) -> None:
     for number in range(40):
         # Grey and small files: this is not about pictures.
-        rendered.write_picture(tmp_path / f"{number:02d}.jpg", np.zeros((360, 480, 3), np.uint8))
+        rendered.write_picture(tmp_path / f"{number:02d}.jpg", np.full((360, 480, 3), 90, np.uint8))
     wire = UdpWire()
     autopilot = HoveringAutopilot(wire)
     outcomes: list[Outcome] = []

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
-
 from ortholoc_edge.adapters.camera.files import FolderSource, VideoSource
-from ortholoc_edge.adapters.camera.live import DeviceSource
+from ortholoc_edge.adapters.camera.live import DeviceSource, OpenCamera
 from ortholoc_edge.adapters.camera.options import CameraOptions
 from ortholoc_edge.adapters.camera.source import FrameSource
+from ortholoc_edge.adapters.camera.stream import open_network, prepare_network, shown_address
+from ortholoc_edge.adapters.camera.v4l2 import V4l2Camera, device_path, prepare
 from ortholoc_edge.adapters.camera.zenoh_frames import ZenohFrames
 from ortholoc_edge.clock import Clock
 from ortholoc_edge.errors import ConfigError
@@ -26,11 +27,10 @@ def open_source(options: CameraOptions, clock: Clock, bus: Bus | None = None) ->
 
     Args:
         bus: what ``zenoh:`` listens on, and nothing else needs; closed by its owner, after the source.
-    Raises: ConfigError if the text can't be understood; CameraError if a folder or video can't be read. A
-        live camera that is missing is waited for instead.
+    Raises: ConfigError if the text can't be understood; CameraError if a folder or video can't be read, or a library
+        is missing. A live camera that is missing is waited for instead.
     """
     kind, _, rest = options.source.partition(":")
-    latency_ns = round(options.latency_ms * _MS)
     if kind == "folder" and rest:
         return FolderSource(Path(rest), options.rate_hz, clock)
     if kind == "video" and rest:
@@ -38,26 +38,35 @@ def open_source(options: CameraOptions, clock: Clock, bus: Bus | None = None) ->
     if kind == "zenoh" and rest:
         if bus is None:
             raise ConfigError(f"camera source {options.source!r} comes over the bus; set [bus] enabled = true")
-        return ZenohFrames(bus, rest, clock, latency_ns)
-    live: str | int
-    backend = cv2.CAP_ANY
+        return ZenohFrames(bus, rest, clock, round(options.latency_ms * _MS))
+    name, opened = _live(kind, rest, options, clock)
+    return DeviceSource(name, opened, clock)
+
+
+def _live(kind: str, rest: str, options: CameraOptions, clock: Clock) -> tuple[str, Callable[[], OpenCamera | None]]:
+    """The name, and what opens it."""
     if kind == "device" and rest:
-        live = int(rest) if rest.isdecimal() else rest
-    elif kind in ("rtsp", "http", "https") and rest.startswith("//"):
-        live, backend = options.source, cv2.CAP_FFMPEG
-    elif kind == "gstreamer" and rest:
-        live, backend = rest, cv2.CAP_GSTREAMER
-    else:
-        raise ConfigError(
-            f"camera source {options.source!r} can't be used; write folder:PATH, video:PATH, "
-            "device:/dev/video0, rtsp://..., http://..., gstreamer:PIPELINE or zenoh:KEY"
-        )
-    return DeviceSource(
-        live,
-        clock,
-        latency_ns=latency_ns,
-        backend=backend,
-        width_px=options.width_px,
-        height_px=options.height_px,
-        fps=options.fps or (options.rate_hz if kind == "device" else None),
+        path = device_path(rest)
+        prepare()
+        return path, lambda: V4l2Camera.open(path, options, clock)
+    if kind in ("rtsp", "http", "https") and rest.startswith("//"):
+        prepare_network()
+        return shown_address(options.source), lambda: open_network(options.source, options, clock)
+    if kind == "gstreamer" and rest:
+        # Not at the top: the bindings come with the system, and few have them.
+        from ortholoc_edge.adapters.camera.gstreamer import GstreamerCamera, load, low_latency
+
+        pipeline = low_latency(rest)
+        load()
+        return "gstreamer", lambda: GstreamerCamera.open(pipeline, options, clock)
+    if kind == "picamera2" and (not rest or rest.isdecimal()):
+        # Not at the top: only a Raspberry Pi has it.
+        from ortholoc_edge.adapters.camera.picamera import Picamera, require_picamera2
+
+        require_picamera2()
+        number = int(rest or "0")
+        return f"picamera2:{number}", lambda: Picamera.open(number, options, clock)
+    raise ConfigError(
+        f"camera source {shown_address(options.source)!r} can't be used; write folder:PATH, video:PATH, "
+        "device:/dev/video0, picamera2:0, rtsp://..., http://..., gstreamer:PIPELINE or zenoh:KEY"
     )

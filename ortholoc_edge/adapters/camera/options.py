@@ -2,29 +2,48 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
+from msgspec import Meta
+
+PixelFormat = Literal["MJPG", "YUYV", "UYVY", "NV12", "YU12", "GREY", "RGB3", "BGR3"]
 
 
 class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The ``[camera]`` table.
 
     Attributes:
-        source: ``folder:PATH`` of pictures, ``video:PATH``, ``device:/dev/video0`` or ``device:0``, a
-            ``rtsp://``, ``http://`` or ``https://`` address, ``gstreamer:PIPELINE`` that ends in
+        source: ``folder:PATH`` of pictures, ``video:PATH``, ``device:/dev/video0`` or ``device:0``,
+            ``picamera2:0``, a ``rtsp://``, ``http://`` or ``https://`` address, ``gstreamer:PIPELINE`` that ends in
             ``appsink``, or ``zenoh:KEY`` of compressed pictures on the bus.
         rate_hz: of a folder; asked of a camera whose ``fps`` is not given.
-        latency_ms: from the middle of the exposure until the driver hands the frame over. It is subtracted
-            from the stamp of live sources; measure it, since at 20 m/s each 50 ms left out are a metre.
-        width_px, height_px, fps: asked of a device; a device that gives other values is used, with a warning.
+        latency_ms: of frames that are stamped when they arrive: from the middle of the exposure until the frame is
+            handed over. Measure it, since at 20 m/s each 50 ms left out are a metre.
+        stamps: "driver": a device's own where they are of our clock, else as "arrival".
+        stamp_of: which moment the driver's stamps are of. "auto": as the driver says.
+        driver_latency_ms: subtracted from the driver's stamps beyond what exposure and readout explain.
+        exposure_ms: asked of a camera; of a stream, which can't be asked, as it was set there. Left out: as it is.
+            Where it is known frames are stamped in its middle, and frames that it will have smeared are refused.
+        gain: asked of a camera: a V4L2 device counts in steps of its own, picamera2 in multiples.
+        format: of pixels, asked of a V4L2 device, as four characters.
+        shutter, readout_ms: whether rows are exposed one after the other, and the time from the first to the last.
+        width_px, height_px, fps: asked of a camera; one that gives other values is used, with a warning.
         realtime: whether a video skips frames that are late, as a camera would; if not, every frame is given.
     """
 
     source: str
-    rate_hz: Annotated[float, msgspec.Meta(gt=0, le=1000)] = 10.0
-    latency_ms: Annotated[float, msgspec.Meta(ge=0, le=5000)] = 0.0
-    width_px: Annotated[int, msgspec.Meta(ge=16, le=16384)] | None = None
-    height_px: Annotated[int, msgspec.Meta(ge=16, le=16384)] | None = None
-    fps: Annotated[float, msgspec.Meta(gt=0, le=1000)] | None = None
+    rate_hz: Annotated[float, Meta(gt=0, le=1000)] = 10.0
+    latency_ms: Annotated[float, Meta(ge=0, le=5000)] = 0.0
+    stamps: Literal["driver", "arrival"] = "driver"
+    stamp_of: Literal["auto", "exposure_start", "frame_start", "frame_end"] = "auto"
+    driver_latency_ms: Annotated[float, Meta(ge=-100, le=1000)] = 0.0
+    exposure_ms: Annotated[float, Meta(gt=0, le=1000)] | Literal["auto"] | None = None
+    gain: Annotated[float, Meta(ge=0, le=100000)] | None = None
+    format: PixelFormat | None = None
+    shutter: Literal["rolling", "global"] = "rolling"
+    readout_ms: Annotated[float, Meta(ge=0, le=200)] = 0.0
+    width_px: Annotated[int, Meta(ge=16, le=16384)] | None = None
+    height_px: Annotated[int, Meta(ge=16, le=16384)] | None = None
+    fps: Annotated[float, Meta(gt=0, le=1000)] | None = None
     realtime: bool = True

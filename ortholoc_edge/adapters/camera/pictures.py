@@ -36,30 +36,35 @@ def read_image(path: Path) -> ImageArray:
 
 def decode_image(data: bytes, name: str, remedy: str) -> ImageArray:
     """An encoded picture, as `read_image`. Raises: CameraError, "NAME is unusable: DEFECT; REMEDY"."""
+    decoded = decode(data)
+    if isinstance(decoded, str):
+        raise CameraError(f"{name} is unusable: {decoded}; {remedy}")
+    return decoded
+
+
+def decode(data: bytes) -> ImageArray | str:
+    """An encoded picture as (H, W, 3) RGB uint8, read-only, or in words why it can't be."""
     defect = _defect(data)
-    if defect is None:
-        try:
-            image = cv2.imdecode(
-                np.frombuffer(data, dtype=np.uint8),
-                cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION,
-            )
-        except cv2.error as error:
-            defect = f"OpenCV can't decode it ({error.err})"
-        else:
-            if image is not None and image.size > 0:
-                return _frozen(image, name)
-            defect = "not a picture that OpenCV can decode"
-    raise CameraError(f"{name} is unusable: {defect}; {remedy}")
+    if defect is not None:
+        return defect
+    try:
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error as error:
+        return f"OpenCV can't decode it ({error.err})"
+    if image is None or image.size == 0:
+        return "not a picture that OpenCV can decode"
+    return frozen_rgb(image, "a picture")
 
 
 def rgb(image: Any, name: str) -> ImageArray:
     """What OpenCV captured, as RGB. Raises: CameraError naming the source."""
     if image.ndim == 2 or image.shape[2] == 1:
-        return _frozen(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), name)
-    return _frozen(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), name)
+        return frozen_rgb(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), name)
+    return frozen_rgb(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), name)
 
 
-def _frozen(image: Any, name: str) -> ImageArray:
+def frozen_rgb(image: Any, name: str) -> ImageArray:
+    """(H, W, 3) RGB as our own, read-only. Raises: CameraError naming the source if it is not uint8."""
     # numpy would wrap a 16-bit 300 to 44 without a word.
     if image.dtype != np.uint8:
         raise CameraError(

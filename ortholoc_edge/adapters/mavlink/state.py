@@ -57,6 +57,7 @@ class AutopilotState:
         ned_from_body: (3, 3); None without an attitude within 0.2 s of the stamp.
         interpolated: whether ``ned_from_body``, and where it is known ``ned_from_gimbal``, lies between two samples
             received; if not it was carried on, and asking again a little later gives a better one.
+        turning_rad_s: (3,) of the body about its own axes; None without an attitude.
         velocity_ned, local_position_ned_m: (3,) of LOCAL_POSITION_NED, relative to the EKF origin.
         local_epoch: rises when the local position jumped, its stream had a gap, the origin moved or the
             autopilot restarted. Positions of two epochs must not be subtracted.
@@ -95,3 +96,4 @@ class AutopilotState:
     position_test_ratio: float | None
     ned_from_gimbal: FloatArray | None = None
     gimbal_sigma_rad: float = 0.0
+    turning_rad_s: FloatArray | None = None

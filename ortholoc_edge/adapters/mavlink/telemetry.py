@@ -217,7 +217,7 @@ class Telemetry:
         if by_boot and self._unconfirmed_after_ns is not None and time_ns > self._unconfirmed_after_ns:
             return self._unknown(stamp_ns)
         flags, ratio = self._estimator_at(stamp_ns)
-        attitude, interpolated = self._attitude_at(time_ns, by_boot)
+        attitude, turning, interpolated = self._attitude_at(time_ns, by_boot)
         position, velocity, epoch = self._local_at(time_ns, by_boot)
         odometry, odometry_epoch = self._odometry_at(time_ns, by_boot)
         gimbal = None if self.gimbal is None else self.gimbal.at(stamp_ns, best[0] if best else None, attitude)
@@ -240,6 +240,7 @@ class Telemetry:
             position_test_ratio=ratio,
             ned_from_gimbal=None if gimbal is None else gimbal.ned_from_gimbal,
             gimbal_sigma_rad=0.0 if gimbal is None else gimbal.sigma_rad,
+            turning_rad_s=turning,
         )
 
     def _unknown(self, stamp_ns: int) -> AutopilotState:
@@ -499,17 +500,19 @@ class Telemetry:
 
     # -- at a stamp --------------------
 
-    def _attitude_at(self, time_ns: int, by_boot: bool) -> tuple[FloatArray | None, bool]:
+    def _attitude_at(self, time_ns: int, by_boot: bool) -> tuple[FloatArray | None, FloatArray | None, bool]:
         chosen = choose(self._attitudes.around(time_ns, by_boot), time_ns, _MAX_EXTRAPOLATION_NS)
         if chosen is None:
-            return None, False
+            return None, None, False
         a, b, t = chosen
         first = rotation.from_quaternion(a.quaternion)
+        rates = np.array(a.rates_rad_s)
         if b is None:
-            turned = first @ rotation.exp(np.array(a.rates_rad_s) * t)
+            turned = first @ rotation.exp(rates * t)
         else:
             turned = rotation.slerp(first, rotation.from_quaternion(b.quaternion), t)
-        return frozen_floats(turned, (3, 3), "ned_from_body"), b is not None
+            rates = (1.0 - t) * rates + t * np.array(b.rates_rad_s)
+        return frozen_floats(turned, (3, 3), "ned_from_body"), frozen_floats(rates, (3,), "rates"), b is not None
 
     def _odometry_at(self, time_ns: int, by_boot: bool) -> tuple[FloatArray | None, int]:
         before, after = self._odometry.around(time_ns, by_boot)

@@ -2,7 +2,8 @@
 /* The live page: what the daemon tells, and above all how old it is. All times are ms of the daemon's clock. */
 
 const REASONS = {
-  bad_frame: "broken frame", no_prior: "nothing says where to look", bad_attitude: "no attitude from the autopilot",
+  bad_frame: "broken frame", dark: "too dark", repeated: "the picture before once more", frozen: "the camera is frozen",
+  motion_blur: "smeared by motion", no_prior: "nothing says where to look", bad_attitude: "no attitude from the autopilot",
   gimbal_unknown: "gimbal's direction unknown", prior_too_wide: "too uncertain where to look",
   outside_map: "looks beyond the map", map_nodata: "the map has a hole here", few_matches: "too few matches",
   few_inliers: "too few inliers", low_inlier_ratio: "most matches disagree", low_contrast: "the map fits here hardly better",

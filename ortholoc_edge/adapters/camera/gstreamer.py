@@ -1,0 +1,154 @@
+"""Frames from a GStreamer pipeline, through its own Python bindings: OpenCV's wheel is built without GStreamer, and an
+OpenCV that has it tells no stamps of the exposure. A frame's time in the pipeline and the pipeline's clock do."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import re
+from typing import Any
+
+import numpy as np
+
+from ortholoc_edge.adapters.camera.live import Shot
+from ortholoc_edge.adapters.camera.options import CameraOptions
+from ortholoc_edge.adapters.camera.pictures import frozen_rgb
+from ortholoc_edge.adapters.camera.stamps import Stamper
+from ortholoc_edge.clock import Clock
+from ortholoc_edge.errors import CameraError, ConfigError
+
+logger = logging.getLogger(__name__)
+
+_MS, _S = 1_000_000, 1_000_000_000
+_START_NS, _PULL_NS = 5 * _S, 2 * _S
+_PROPERTY = re.compile(r"([\w-]+)\s*=\s*(\S+)")
+# An appsink of its own accord queues without end, and holds each frame until it is time to show it.
+_SINK = {"drop": "true", "max-buffers": "1", "sync": "false"}
+_NO_TIME = 2**64 - 1
+
+
+def low_latency(pipeline: str) -> str:
+    """A pipeline whose ``appsink`` gives the newest frame at once, as RGB.
+
+    Raises: ConfigError if it does not end in one, or in one that was told to queue.
+    """
+    head, mark, sink = pipeline.rpartition("!")
+    if not mark or not head.strip() or not sink.split() or sink.split()[0] != "appsink":
+        raise ConfigError(
+            f"camera source gstreamer: the pipeline ends in {sink.strip() or 'nothing'!r}; it must end in '! appsink'"
+        )
+    given = dict(_PROPERTY.findall(sink))
+    for name, values in (("drop", ("true", "1")), ("max-buffers", ("1", "2"))):
+        if name in given and given[name].lower() not in values:
+            raise ConfigError(
+                f"camera source gstreamer: appsink has {name}={given[name]}, and frames that queue are late by what "
+                f"no stamp shows; write {name}={_SINK[name]} or leave it out"
+            )
+    more = " ".join(f"{name}={value}" for name, value in _SINK.items() if name not in given)
+    # Passes on untouched what is RGB or grey already.
+    return f"{head.strip()} ! videoconvert ! video/x-raw,format=(string){{RGB,GRAY8}} ! {sink.strip()} {more}".strip()
+
+
+def load() -> Any:
+    """GStreamer's bindings, ready. Raises: CameraError with what to install."""
+    try:
+        gi = importlib.import_module("gi")
+        gi.require_version("Gst", "1.0")
+        gi.require_version("GstApp", "1.0")
+        gst: Any = importlib.import_module("gi.repository.Gst")
+        # The sink's methods come with it.
+        importlib.import_module("gi.repository.GstApp")
+        gst.init(None)
+    except (ImportError, ValueError, AttributeError) as error:
+        raise CameraError(
+            f"camera source gstreamer: this Python has no bindings of GStreamer ({error}); sudo apt install python3-gi "
+            "gir1.2-gst-plugins-base-1.0 gstreamer1.0-plugins-base, and make the virtual environment with "
+            "--system-site-packages, since they come with the system (docs/cameras.md)"
+        ) from error
+    return gst
+
+
+class GstreamerCamera:
+    """See `OpenCamera`."""
+
+    def __init__(self, gst: Any, pipeline: Any, sink: Any, options: CameraOptions, clock: Clock) -> None:
+        """
+        Args:
+            gst: of :func:`load`.
+            pipeline: that plays. sink: its appsink.
+        """
+        self._gst, self._pipeline, self._sink, self._options, self._clock = gst, pipeline, sink, options, clock
+        self._stamper = Stamper("gstreamer", options)
+        wanted = options.exposure_ms
+        # What the pipeline sets it to.
+        self._exposure_ns = round(wanted * _MS) if isinstance(wanted, float | int) else None
+
+    @staticmethod
+    def open(pipeline: str, options: CameraOptions, clock: Clock) -> GstreamerCamera | None:
+        """A pipeline of :func:`low_latency`; None while it does not play.
+
+        Raises: CameraError where it is no pipeline, or an element is not installed.
+        """
+        gst = load()
+        try:
+            made = gst.parse_launch(pipeline)
+        except Exception as error:  # GLib.Error, which is not there before the bindings are
+            raise CameraError(f"camera source gstreamer: {error}; try it with gst-launch-1.0") from error
+        camera = GstreamerCamera(gst, made, _appsink(gst, made), options, clock)
+        made.set_state(gst.State.PLAYING)
+        result, _, _ = made.get_state(_START_NS)
+        if result in (gst.StateChangeReturn.FAILURE, gst.StateChangeReturn.ASYNC):
+            camera.tell_error()
+            camera.release()
+            return None
+        logger.info("camera gstreamer open: %s", pipeline.split(maxsplit=1)[0])
+        return camera
+
+    def grab(self) -> Shot | None:
+        """See `OpenCamera.grab`."""
+        stamp_ns = None
+        while stamp_ns is None:
+            sample = self._sink.try_pull_sample(_PULL_NS)
+            if sample is None:
+                self.tell_error()
+                return None
+            buffer = sample.get_buffer()
+            arrival_ns = self._clock.now_ns()
+            captured_ns = self._pipeline.get_base_time() + buffer.pts if buffer.pts != _NO_TIME else 0
+            stamp_ns = self._stamper.stamp_ns(captured_ns, arrival_ns, self._exposure_ns)
+        structure = sample.get_caps().get_structure(0)
+        width, height = structure.get_value("width"), structure.get_value("height")
+        channels = 1 if structure.get_value("format") == "GRAY8" else 3
+        mapped, info = buffer.map(self._gst.MapFlags.READ)
+        if not mapped:
+            return None
+        try:
+            data = np.frombuffer(info.data, np.uint8)
+        finally:
+            buffer.unmap(info)
+        # Rows begin at multiples of four bytes.
+        rows = data[: len(data) // height * height].reshape(height, -1)[:, : width * channels]
+        image = rows.reshape(height, width, channels) if channels == 3 else rows
+        return Shot(frozen_rgb(np.array(image), "camera gstreamer"), stamp_ns, self._exposure_ns)
+
+    def tell_error(self) -> None:
+        """What an element said went wrong."""
+        message = self._pipeline.get_bus().pop_filtered(self._gst.MessageType.ERROR)
+        if message is not None:
+            error, _ = message.parse_error()
+            logger.warning("camera gstreamer: %s: %s", message.src.get_name(), error.message)
+
+    def release(self) -> None:
+        """See `OpenCamera.release`."""
+        self._pipeline.set_state(self._gst.State.NULL)
+
+
+def _appsink(gst: Any, pipeline: Any) -> Any:
+    """The pipeline's; `low_latency` has seen to it that there is one."""
+    sinks = pipeline.iterate_sinks()
+    while True:
+        result, sink = sinks.next()
+        if result == gst.IteratorResult.OK and sink.get_factory().get_name() == "appsink":
+            return sink
+        if result != gst.IteratorResult.OK:
+            raise CameraError("camera source gstreamer: the pipeline has no appsink; end it in '! appsink'")
