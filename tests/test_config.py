@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 from pathlib import Path
 
 import pytest
@@ -11,7 +10,7 @@ import pytest
 from ortholoc_edge.adapters.bus import Bus, BusOptions
 from ortholoc_edge.adapters.messages import rejection_message
 from ortholoc_edge.config import read_config, read_intrinsics
-from ortholoc_edge.errors import ConfigError, LinkError
+from ortholoc_edge.errors import ConfigError
 from ortholoc_edge.matching.registry import make_method
 from ortholoc_edge.matching.types import Structural
 from ortholoc_edge.pipeline.outcome import Reason, Rejected
@@ -156,13 +155,6 @@ def test_wrong_intrinsics_name_the_file(raw: object, tmp_path: Path) -> None:
 
 
 # -- the bus: what a restart may mend, and what it can't -----------------------
-
-
-def test_a_port_in_use_is_no_mistake_of_the_configuration() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        endpoint = f"tcp/127.0.0.1:{server.getsockname()[1]}"
-        with pytest.raises(LinkError, match=r"127\.0\.0\.1.*\[bus\]"):
-            Bus(BusOptions(enabled=True, listen=(endpoint,)))
 
 
 @pytest.mark.parametrize(
