@@ -49,7 +49,7 @@ class Camera:
         with socket.create_server(("127.0.0.1", 0)) as server:
             endpoint = f"tcp/127.0.0.1:{server.getsockname()[1]}"
         self.bus = Bus(BusOptions(listen=(endpoint,)), takes_pictures=True)
-        options = CameraOptions(source=f"zenoh:{KEY}", latency_ms=30.0)
+        options = CameraOptions(source=f"zenoh:{KEY}", latency_ms=30.0, exposure_ms=2.0)
         self.source = open_source(options, SystemClock(), self.bus)
         assert isinstance(self.source, ZenohFrames)
         config = zenoh.Config()
@@ -97,9 +97,9 @@ def camera(made: Camera) -> Camera:
 
 def test_pictures_with_the_stamp_of_this_computer(camera: Camera) -> None:
     stamp_ns = time.monotonic_ns() - 80 * MS
-    camera.publish(jpeg(), {"stamp_ns": stamp_ns, "name": "IMG_1"})
+    camera.publish(jpeg(), {"stamp_ns": stamp_ns, "exposure_ns": 3 * MS, "name": "IMG_1"})
     frame = camera.read()
-    assert (frame.stamp_ns, frame.name) == (stamp_ns, "IMG_1")
+    assert (frame.stamp_ns, frame.exposure_ns, frame.name) == (stamp_ns, 3 * MS, "IMG_1")
     # Red stays red.
     assert np.abs(frame.image.astype(int) - RED).max() < 12
     assert not frame.image.flags.writeable
@@ -111,7 +111,7 @@ def test_compressed_images_of_ros(camera: Camera, order: str) -> None:
     camera.publish(ros(jpeg(), exposed_ns + wall_clock_ns() - time.monotonic_ns(), order))
     frame = camera.read()
     assert abs(frame.stamp_ns - exposed_ns) < 5 * MS
-    assert frame.image.shape == RED.shape
+    assert (frame.image.shape, frame.exposure_ns) == (RED.shape, 2 * MS)
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,8 @@ def open_source(options: CameraOptions, clock: Clock, bus: Bus | None = None) ->
     if kind == "zenoh" and rest:
         if bus is None:
             raise ConfigError(f"camera source {options.source!r} comes over the bus; set [bus] enabled = true")
-        return ZenohFrames(bus, rest, clock, round(options.latency_ms * _MS))
+        exposure_ns = round(options.exposure_ms * _MS) if isinstance(options.exposure_ms, float) else None
+        return ZenohFrames(bus, rest, clock, round(options.latency_ms * _MS), exposure_ns)
     name, opened = _live(kind, rest, options, clock)
     return DeviceSource(name, opened, clock)
 

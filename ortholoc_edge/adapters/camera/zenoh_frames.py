@@ -3,7 +3,7 @@
 Two forms are understood:
 
 - a picture file (JPEG, PNG, WebP) as payload. Its time may stand in the attachment, as JSON: ``stamp_ns``, of this
-  computer's monotonic clock, or ``unix_ns``, by its date; and ``name``;
+  computer's monotonic clock, or ``unix_ns``, by its date; and ``exposure_ns``, ``name``;
 - ROS 2's ``sensor_msgs/msg/CompressedImage``, as zenoh-plugin-ros2dds and rmw_zenoh carry it (CDR). Its header has the
   date.
 
@@ -18,9 +18,10 @@ import struct
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
+from msgspec import Meta
 
 from ortholoc_edge.adapters.camera.pictures import decode_image
 from ortholoc_edge.adapters.camera.source import BadFrameError, EndOfFrames
@@ -45,6 +46,7 @@ _REMEDY = "look at the program that publishes it"
 class _Attachment(msgspec.Struct, frozen=True):
     stamp_ns: int | None = None
     unix_ns: int | None = None
+    exposure_ns: Annotated[int, Meta(gt=0)] | None = None
     name: str | None = None
 
 
@@ -55,6 +57,7 @@ class CompressedPicture:
     data: bytes
     stamp_ns: int | None = None
     unix_ns: int | None = None
+    exposure_ns: int | None = None
     name: str | None = None
 
 
@@ -72,15 +75,18 @@ class ZenohFrames:
         key: str,
         clock: Clock,
         latency_ns: int = 0,
+        exposure_ns: int | None = None,
         wall_ns: Callable[[], int] = wall_clock_ns,
     ) -> None:
         """
         Args:
             latency_ns: subtracted from the arrival of what has no time of its own.
+            exposure_ns: of pictures that do not say theirs; None where it is not known.
             wall_ns: the date, nanoseconds since 1970.
         Raises: ConfigError if ``key`` is no key expression.
         """
         self._key, self._clock, self._latency_ns, self._wall_ns = key, clock, latency_ns, wall_ns
+        self._exposure_ns = exposure_ns
         self._condition = threading.Condition()
         self._waiting: tuple[int, bytes, bytes] | None = None
         self._closed = False
@@ -117,7 +123,7 @@ class ZenohFrames:
             image = decode_image(picture.data, f"picture {name} of {where}", _REMEDY)
         except CameraError as error:
             raise BadFrameError(str(error), stamp_ns, name) from error
-        return Frame(stamp_ns, image, name)
+        return Frame(stamp_ns, image, name, picture.exposure_ns or self._exposure_ns)
 
     def _stamp(self, picture: CompressedPicture, arrived_ns: int) -> int:
         stamp_ns = picture.stamp_ns
@@ -156,7 +162,7 @@ def unpack(payload: bytes, attachment: bytes = b"") -> CompressedPicture:
     except (msgspec.DecodeError, msgspec.ValidationError):
         # Of somebody else's making (rmw_zenoh has one, too): the picture is still a picture.
         return CompressedPicture(payload)
-    return CompressedPicture(payload, said.stamp_ns, said.unix_ns, said.name)
+    return CompressedPicture(payload, said.stamp_ns, said.unix_ns, said.exposure_ns, said.name)
 
 
 def _compressed_image(payload: bytes) -> CompressedPicture:
