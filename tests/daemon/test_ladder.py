@@ -1,4 +1,4 @@
-"""The real daemon on a computer that gets hot and cools: what it leaves out, whom it tells, and that a replay agrees."""
+"""The real daemon on a computer that gets hot and cools: what it leaves out, whom it tells, and what a replay says."""
 
 from __future__ import annotations
 

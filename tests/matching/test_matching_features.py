@@ -129,7 +129,8 @@ def test_reduced_it_works_on_less_and_the_matcher_itself_as_before(matcher: Matc
     np.testing.assert_array_equal(matcher.extract(scene).keypoints_px, whole.keypoints_px)
     shift = np.array([[1, 0, 32], [0, 1, -16], [0, 0, 1.0]])
     errors = _errors(half, scene[64:704, 64:960], scene[80:720, 32:928], shift)
-    assert len(errors) > 40 and np.abs(np.median(errors, axis=0)).max() < 0.6
+    # Of its own pixels they are 2.8.
+    assert len(errors) > 40 and np.abs(np.median(errors, axis=0)).max() < 1.0
     # It ends where nothing is left to see.
     assert half.reduced(0.1).working_px == 128
 

@@ -201,8 +201,8 @@ def latency(args: argparse.Namespace) -> None:
                         page.tell(
                             Health(
                                 now_ns=stamp_ns, tracker="track", paused=False, autopilot=record, vehicle="x",
-                                trouble=None, computer=computer, budget_ms=200.0, rung=0, rungs=5, rate_hz=None, rung_why="",
-                                statistics={"sent": 1},
+                                trouble=None, computer=computer, budget_ms=200.0, rung=0, rungs=5, rate_hz=None,
+                                rung_why="", statistics={"sent": 1},
                             )
                         )  # fmt: skip
                 wall[mode].append(1e3 * (time.perf_counter() - began))

@@ -1,5 +1,6 @@
 """Detail and rate against time, load and heat: steps down under strain, up when there is room, and never swings."""
 
+import itertools
 import math
 
 import pytest
@@ -222,7 +223,7 @@ def test_constant_conditions_make_no_swinging_and_relief_brings_everything_back(
     ladder = Ladder(3, 100.0)
     computer.hour(ladder, 0)
     rungs = computer.hour(ladder, 3600, 2.0)
-    ups = sum(after < before for before, after in zip(rungs, rungs[1:], strict=False))
+    ups = sum(after < before for before, after in itertools.pairwise(rungs))
     # A rung that does not last is tried ever more rarely, from 10 s to 640 s: of four that is the most in two hours.
     assert ups <= 4 * 7200 / 640
     # Whatever it was: well again, all of it comes back.
