@@ -316,11 +316,12 @@ class Daemon:
         Raises: OrtholocError where a part failed for good; systemd then starts afresh.
         """
         with self._resources as resources:
-            self._warm_up()
-            self._link.set_system_status(SystemStatus.STANDBY)
             resources.callback(self._say_goodbye)
             resources.callback(self._link.stop)
+            # First: an autopilot's heart beats once a second, and until it was heard there is no attitude.
             self._link.start()
+            self._warm_up()
+            self._link.set_system_status(SystemStatus.STANDBY)
             capture = threading.Thread(target=self._capture, args=(stop,), name="capture", daemon=True)
             resources.callback(self._join_capture, capture, stop)
             self._capture_beat_ns = self._clock.now_ns()

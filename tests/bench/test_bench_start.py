@@ -32,7 +32,7 @@ def test_a_daemon_is_ready_and_then_the_autopilot_has_a_fix(capsys: pytest.Captu
 def test_a_daemon_that_ends_is_told_with_its_last_words(tmp_path: Path) -> None:
     config = tmp_path / "config.toml"
     config.write_text("[camera]\n", encoding="utf-8")
-    with pytest.raises(OrtholocError, match=r"the daemon ended with 78 before ready; said: .*config\.toml: .*source"):
+    with pytest.raises(OrtholocError, match=r"ended with 78 before ready; it said: .*config\.toml: .*source"):
         time_start(config, lambda: None)
 
 
