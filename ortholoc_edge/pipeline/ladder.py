@@ -46,7 +46,7 @@ class LadderOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         rates_hz: how many frames a second are localized at most on the rungs below the least detail; falling. Between
             fixes the autopilot is told the last one carried on, for `LinkOptions.max_repeat_s`.
         hot_c: a processor this hot, or one that is throttled, steps down. cool_c: it must be no hotter to step up.
-        max_load_percent: of all cores together; a busier computer steps down in detail.
+        max_load_percent: of all cores together; a busier computer steps down in detail. 100: none ever is.
     """
 
     rates_hz: tuple[Annotated[float, Meta(gt=0, le=1000)], ...] = (5.0, 2.0)
@@ -216,7 +216,7 @@ class Ladder:
             return
         if len(self._loads) == _LOADS and self._rung < self._details - 1:
             load = fmean(self._loads)
-            if load >= self._options.max_load_percent:
+            if load > self._options.max_load_percent:
                 self._step(1, Cause.LOAD, f"processor busy to {load:.0f} %", now_ns)
                 return
         self._rise(now_ns)

@@ -113,6 +113,7 @@ def test_throttling_is_heat_whatever_the_sensor_says():
 def test_load_steps_down_in_detail_only_and_holds_a_step_up():
     ladder = Ladder(3, 100.0)
     assert observed(ladder, Strain(99.0), 40) == [0] * 4 + [1] * 5 + [2] * 31
+    assert set(observed(Ladder(3, 100.0, LadderOptions(max_load_percent=100.0)), Strain(100.0), 40)) == {0}
     ladder = Ladder(2, 100.0)
     climbed(ladder, [150.0] * 5)
     for number in range(5, 200):
