@@ -173,6 +173,9 @@ class Reporter:
 
     def step(self, now_ns: int) -> None:
         """To be called often; does its work once a second."""
+        self._tell("anybody", lambda: self._step(now_ns))
+
+    def _step(self, now_ns: int) -> None:
         for step in self._navigator.ladder.take_steps():
             self._tell_step(step)
         if now_ns - self._last_ns < _INTERVAL_NS:
@@ -228,6 +231,9 @@ class Reporter:
             self._tell("the bus", lambda: bus.publish(message))
         if (log := self._log) is not None:
             self._tell("the flight log", lambda: log.ladder(message))
+        self._tell("the pilot of detail", lambda: self._tell_pilot(step))
+
+    def _tell_pilot(self, step: Step) -> None:
         for severity, text in self._herald.tell_step(step):
             self._link.send_status_text(severity, text)
 

@@ -104,9 +104,9 @@ def test_configuration_keys_that_the_documents_name_exist():
         if document.name == "simulation.md":
             continue  # its tables are those of scenarios
         for line in code_of(document):
-            # `link.fusion` and the like are statistics, and `page.js` is a file.
+            # `link.fusion`, `camera.frames` and the like are statistics, and `page.js` is a file.
             named = re.fullmatch(r"\[([\w.]+)\] (\w+)(?: = .*)?", line) or re.fullmatch(
-                r"(?!link\.)([a-z]\w*(?:\.\w+)*)\.(?!(?:js|py|toml)\b)(\w+)", line
+                r"(?!link\.|camera\.)([a-z]\w*(?:\.\w+)*)\.(?!(?:js|py|toml)\b)(\w+)", line
             )
             if named is None or named[1].split(".")[0] not in config.Config.__struct_fields__:
                 continue
