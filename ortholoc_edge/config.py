@@ -30,6 +30,7 @@ from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.matching.providers import ProviderName
 from ortholoc_edge.matching.types import STRUCTURAL
+from ortholoc_edge.pipeline.ladder import LadderOptions
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
 from ortholoc_edge.pipeline.navigator import TimingOptions
 from ortholoc_edge.pipeline.picture import PictureOptions
@@ -200,6 +201,7 @@ class Config(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     witness: WitnessOptions = field(default_factory=WitnessOptions)
     attitude: AttitudeOptions = field(default_factory=AttitudeOptions)
     timing: TimingOptions = field(default_factory=TimingOptions)
+    ladder: LadderOptions = field(default_factory=LadderOptions)
     log: LogOptions = field(default_factory=LogOptions)
     bus: BusOptions = field(default_factory=BusOptions)
     page: PageOptions = field(default_factory=PageOptions)

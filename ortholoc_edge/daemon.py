@@ -25,6 +25,7 @@ from ortholoc_edge.adapters import systemd
 from ortholoc_edge.adapters.bus import Bus, bus_of
 from ortholoc_edge.adapters.camera import BadFrameError, DeviceSource, EndOfFrames, FrameSource, open_source
 from ortholoc_edge.adapters.commands import Answer, BusyError, Desk
+from ortholoc_edge.adapters.computer import ComputerReader
 from ortholoc_edge.adapters.flight_log import FlightLog
 from ortholoc_edge.adapters.mavlink import AutopilotLink, Statistic, SystemStatus
 from ortholoc_edge.adapters.messages import NAME_OF_COMMAND, Command, CommandReply, ConfigMessage
@@ -127,12 +128,14 @@ class Daemon:
         frames: FrameSource | None = None,
         matcher: AnyMatcher | None = None,
         clock: Clock | None = None,
+        computer: ComputerReader | None = None,
         on_outcome: OutcomeListener | None = None,
     ) -> None:
         """
         Args:
             frames: instead of ``config.camera``.
             matcher: instead of ``config.matcher``.
+            computer: whose load and heat are looked at, instead of this one.
             on_outcome: told of every outcome, in the worker's thread; must return at once.
         """
         self._config = config
@@ -194,6 +197,7 @@ class Daemon:
                 self._store,
                 self._counts,
                 self._commander,
+                computer or ComputerReader(),
                 replaced=lambda: self._slot.replaced,
                 camera=lambda: self._frames.counts() if isinstance(self._frames, DeviceSource) else {},
                 unix_minus_stamp_ns=self._unix_minus_stamp_ns,
@@ -249,7 +253,7 @@ class Daemon:
         tuning = tuning_of(plan.config)
         if tuning != tuning_of(self._config):
             self._navigator.retune(tuning)
-        self._navigator.ladder.allow(plan.config.timing.budget_ms)
+        self._navigator.ladder.allow(plan.config.timing.budget_ms, plan.config.ladder, self._clock.now_ns())
         self._vehicle.retune(plan.config.attitude)
         self._commander.lost_sigma_m = plan.config.tracker.lost_sigma_m
         if self._log is not None:
@@ -284,11 +288,7 @@ class Daemon:
         from ortholoc_edge.adapters.page.options import checked
 
         fixed = config.mount.body_from_camera() if config.mount.gimbal_selection() is None else None
-        about = {
-            "matcher": self._matcher.name,
-            "budget_ms": config.timing.budget_ms,
-            "vehicle": config.bus.vehicle,
-        }
+        about = {"matcher": self._matcher.name, "vehicle": config.bus.vehicle}
         listen = checked(config.page, os.environ)
         return GroundPage(listen, self._clock, self._store, config.intrinsics.camera(), fixed, about)
 
@@ -316,11 +316,12 @@ class Daemon:
         Raises: OrtholocError where a part failed for good; systemd then starts afresh.
         """
         with self._resources as resources:
-            self._warm_up()
-            self._link.set_system_status(SystemStatus.STANDBY)
             resources.callback(self._say_goodbye)
             resources.callback(self._link.stop)
+            # First: an autopilot's heart beats once a second, and until it was heard there is no attitude.
             self._link.start()
+            self._warm_up()
+            self._link.set_system_status(SystemStatus.STANDBY)
             capture = threading.Thread(target=self._capture, args=(stop,), name="capture", daemon=True)
             resources.callback(self._join_capture, capture, stop)
             self._capture_beat_ns = self._clock.now_ns()
@@ -392,8 +393,10 @@ class Daemon:
                     self._reporter.publish(None, Rejected(item.stamp_ns, Reason.BAD_FRAME, item.why))
                 elif self._commander.paused:
                     self._reporter.publish(item, Rejected(item.stamp_ns, Reason.PAUSED, "by command; send resume"))
-                else:
+                elif self._navigator.ladder.is_due(item.stamp_ns):
                     self._handle(item, stop)
+                else:
+                    self._counts["frames_skipped"] += 1
                 errors = 0
             except Exception as error:  # one spot per thread, around one item (house style)
                 errors += 1
@@ -405,12 +408,7 @@ class Daemon:
 
     def report(self) -> None:
         """Tell the autopilot, the ground station and systemd how it goes, where it is time for that."""
-        try:
-            self._reporter.step(self._clock.now_ns())
-        except Exception:  # a defect there must not end what it reports of, and would again after each restart
-            self._counts["report_errors"] += 1
-            if self._counts["report_errors"] == 1:
-                logger.exception("reporting")
+        self._reporter.step(self._clock.now_ns())
 
     def _feed_watchdog(self) -> None:
         """Called by the worker, so while that comes round; and only while the capture thread comes back from its reads
@@ -510,6 +508,7 @@ def make_navigator(
         Tracker(store.pack.georeference, fixed, config.tracker, first_reset_counter, config.witness),
         budget_ms,
         structs.replace(config.picture, refuse_repeated=config.picture.refuse_repeated and alive),
+        config.ladder,
     )
 
 

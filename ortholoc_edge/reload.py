@@ -25,6 +25,7 @@ RELOADABLE = (
     "bus.commands",
     "bus.image_px",
     "bus.image_rate_hz",
+    "ladder",
     "localizer.gate",
     "log.level",
     "log.max_mb",

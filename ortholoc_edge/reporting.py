@@ -19,6 +19,7 @@ from ortholoc_edge.adapters.mavlink.sources import SourceSwitch, Withheld
 from ortholoc_edge.adapters.messages import (
     AutopilotMessage,
     HealthMessage,
+    LadderMessage,
     StateMessage,
     StatsMessage,
     fix_message,
@@ -26,6 +27,7 @@ from ortholoc_edge.adapters.messages import (
 )
 from ortholoc_edge.commander import Commander
 from ortholoc_edge.pipeline.frame import Frame
+from ortholoc_edge.pipeline.ladder import Step, Strain
 from ortholoc_edge.pipeline.navigator import Navigator
 from ortholoc_edge.pipeline.outcome import Fix, Outcome
 from ortholoc_edge.pipeline.tracker import TrackerStatus
@@ -50,7 +52,11 @@ OutcomeListener = Callable[[Frame | None, Outcome], None]
 
 
 class Reporter:
-    """Tells outcomes as they come, and everything else once a second. Used by one thread, but for `statistics`."""
+    """Tells outcomes as they come, and everything else once a second. Used by one thread, but for `statistics`.
+
+    Whom it tells are told apart from each other: a defect in one, which would be there again after a restart, must end
+    neither the flight nor what the others hear. It is counted (``report_errors``), and logged once.
+    """
 
     def __init__(
         self,
@@ -62,6 +68,7 @@ class Reporter:
         store: MapStore,
         counts: Counter[str],
         commander: Commander,
+        computer: ComputerReader,
         *,
         replaced: Callable[[], int],
         camera: Callable[[], Mapping[str, int]],
@@ -76,6 +83,7 @@ class Reporter:
             options, lever_arm_m: as configured; the autopilot's settings are held against them.
             counts: the daemon's, to which ours are added.
             commander: its `Commander.paused` is told.
+            computer: that we run on; the navigator's ladder hears of it, too.
             replaced: how many frames a newer one took the place of.
             camera: what a live camera counts, `DeviceSource.counts`.
             unix_minus_stamp_ns: what makes dates of stamps, now.
@@ -91,7 +99,8 @@ class Reporter:
         self.remark = ""
         self._fixes_before = (0, 0)
         self._last_outcome: Outcome | None = None
-        self._computer = ComputerReader()
+        self._computer = computer
+        self._defective: set[str] = set()
         self._checkup: Checkup | None = Checkup(link, options, lever_arm_m=lever_arm_m, ages=link.ages)
         self._findings_told: set[str] = set()
         self._damage_told = 0
@@ -103,8 +112,8 @@ class Reporter:
 
     def statistics(self) -> dict[str, Statistic]:
         """Counters since the start: the daemon's, the log's and the bus's drops, the link's under ``link.`` and a
-        live camera's under ``camera.``; the rung of detail that frames are localized at, and whether GNSS agrees with
-        the fixes."""
+        live camera's under ``camera.``; the rung that frames are localized on, and whether GNSS agrees with the
+        fixes."""
         witness = self._navigator.tracker.witness.report
         return {
             **self._counts,
@@ -127,16 +136,26 @@ class Reporter:
         if isinstance(outcome, Fix):
             self._last_fix_ns = outcome.stamp_ns
         self._counts["fixes" if isinstance(outcome, Fix) else "rejected"] += 1
-        if self._log is not None:
-            self._log.put(frame, outcome, step)
         self._last_outcome = outcome
-        if self._bus is not None:
-            self._publish_on(self._bus, frame, outcome, step)
-        if self._page is not None:
+        if (log := self._log) is not None:
+            self._tell("the flight log", lambda: log.put(frame, outcome, step))
+        if (bus := self._bus) is not None:
+            self._tell("the bus", lambda: self._publish_on(bus, frame, outcome, step))
+        if (page := self._page) is not None:
             _, state, circumstances = step or (None, None, None)
-            self._page.put(frame, outcome, state, circumstances)
-        if self._on_outcome is not None:
-            self._on_outcome(frame, outcome)
+            self._tell("the ground page", lambda: page.put(frame, outcome, state, circumstances))
+        if (listener := self._on_outcome) is not None:
+            self._tell("the listener", lambda: listener(frame, outcome))
+
+    def _tell(self, whom: str, tell: Callable[[], None]) -> None:
+        """See the class."""
+        try:
+            tell()
+        except Exception:
+            self._counts["report_errors"] += 1
+            if whom not in self._defective:
+                self._defective.add(whom)
+                logger.exception("reporting to %s", whom)
 
     def _publish_on(self, bus: Bus, frame: Frame | None, outcome: Outcome, step: LoggedStep | None) -> None:
         unix_ns = outcome.stamp_ns + self._unix_minus_stamp_ns()
@@ -154,48 +173,88 @@ class Reporter:
 
     def step(self, now_ns: int) -> None:
         """To be called often; does its work once a second."""
+        self._tell("anybody", lambda: self._step(now_ns))
+
+    def _step(self, now_ns: int) -> None:
+        for step in self._navigator.ladder.take_steps():
+            self._tell_step(step)
         if now_ns - self._last_ns < _INTERVAL_NS:
             return
         self._last_ns = now_ns
         # Others hear of what was sent: a fix that nobody is told of, for want of an origin, say, serves nobody.
         active = self._link.sent_since(now_ns - _FRESH_NS)
         self._link.set_system_status(SystemStatus.ACTIVE if active else SystemStatus.STANDBY)
-        # First what steers: a defect in what is only told must not keep it from being done.
-        self._switch_sources(self._navigator.tracker.witness.report.state, now_ns)
-        self._report_autopilot(now_ns)
+        self._tell(
+            "the source switch",
+            lambda: self._switch_sources(self._navigator.tracker.witness.report.state, now_ns),
+        )
         computer = self._computer.read()
+        self._navigator.ladder.observe(
+            Strain(computer.load_percent, computer.processor_c, computer.is_throttled or computer.is_hot), now_ns
+        )
+        self._tell("the autopilot", lambda: self._report_autopilot(now_ns))
         self._link.report_computer(computer)
         if self._link.connected():
-            self._report_damage()
-            self._report_audit(now_ns)
-            self._report_origin(now_ns)
-        if self._bus is not None:
-            self.publish_state(now_ns)
-            self._bus.publish(self._health(now_ns, computer))
-        if self._page is not None:
-            self._page.tell(self._page_health(now_ns, computer))
-        if self._log is not None:
-            self._log.note(now_ns, self.statistics())
+            self._tell("the pilot of damage", self._report_damage)
+            self._tell("the pilot of settings", lambda: self._report_audit(now_ns))
+            self._tell("the pilot of the origin", lambda: self._report_origin(now_ns))
+        if (bus := self._bus) is not None:
+            self._tell("the bus", lambda: self.publish_state(now_ns))
+            self._tell("the bus", lambda: bus.publish(self._autopilot(now_ns)))
+            self._tell("the bus", lambda: bus.publish(self._health(now_ns, computer)))
+        if (page := self._page) is not None:
+            self._tell("the ground page", lambda: page.tell(self._page_health(now_ns, computer)))
+        if (log := self._log) is not None:
+            self._tell("the flight log", lambda: log.note(now_ns, self.statistics()))
+        self._tell("systemd", lambda: self._notify_systemd(now_ns))
+
+    def _notify_systemd(self, now_ns: int) -> None:
         counts = self._counts
         status = "paused by command" if self._commander.paused else self._status(now_ns)
         remark = f"; {self.remark}" if self.remark else ""
         systemd.notify(f"STATUS={status}, {counts['fixes']} fixes, {counts['rejected']} rejected{remark}")
 
+    def _tell_step(self, step: Step) -> None:
+        ladder = self._navigator.ladder
+        message = LadderMessage(
+            stamp_ns=step.stamp_ns,
+            unix_ns=step.stamp_ns + self._unix_minus_stamp_ns(),
+            rung=step.rung,
+            was=step.was,
+            rungs=ladder.rungs,
+            details=ladder.details,
+            rate_hz=step.rate_hz,
+            cause=step.cause.value,
+            why=step.why,
+        )
+        if (bus := self._bus) is not None:
+            self._tell("the bus", lambda: bus.publish(message))
+        if (log := self._log) is not None:
+            self._tell("the flight log", lambda: log.ladder(message))
+        self._tell("the pilot of detail", lambda: self._tell_pilot(step))
+
+    def _tell_pilot(self, step: Step) -> None:
+        for severity, text in self._herald.tell_step(step):
+            self._link.send_status_text(severity, text)
+
     def _page_health(self, now_ns: int, computer: ComputerStatus) -> Health:
         from ortholoc_edge.adapters.page.ground_page import Health
 
-        witness, ladder, vehicle = self._navigator.tracker.witness.report, self._navigator.ladder, self._link.vehicle
-        unix_ns = now_ns + self._unix_minus_stamp_ns()
+        ladder, vehicle = self._navigator.ladder, self._link.vehicle
+        last = ladder.last_step
         return Health(
             now_ns=now_ns,
             tracker=self._status(now_ns).value,
             paused=self._commander.paused,
-            autopilot=autopilot_message(now_ns, unix_ns, self._link, witness, self._sources.on_vision),
+            autopilot=self._autopilot(now_ns),
             vehicle=None if vehicle is None else f"{vehicle.autopilot.value} {vehicle.firmware}",
             trouble=self._link.trouble(),
             computer=computer,
+            budget_ms=ladder.budget_ms,
             rung=ladder.rung,
             rungs=ladder.rungs,
+            rate_hz=ladder.rate_hz,
+            rung_why="" if last is None else last.why,
             statistics=self.statistics(),
         )
 
@@ -263,14 +322,15 @@ class Reporter:
             self._link.send_status_text(Severity.WARNING, "OrthoLoC: EKF origin unknown, fixes not sent")
 
     def _report_autopilot(self, now_ns: int) -> None:
-        """Say and publish what the autopilot does with the fixes and whether GNSS agrees with them."""
+        """Say what the autopilot does with the fixes and whether GNSS agrees with them."""
         fusion, witness = self._link.fusion, self._navigator.tracker.witness.report
         for severity, text in self._herald.tell(fusion, witness):
             logger.log(logging.INFO if severity >= Severity.NOTICE else logging.WARNING, "%s", text)
             self._link.send_status_text(severity, text)
-        if self._bus is not None:
-            unix_ns = now_ns + self._unix_minus_stamp_ns()
-            self._bus.publish(autopilot_message(now_ns, unix_ns, self._link, witness, self._sources.on_vision))
+
+    def _autopilot(self, now_ns: int) -> AutopilotMessage:
+        unix_ns, witness = now_ns + self._unix_minus_stamp_ns(), self._navigator.tracker.witness.report
+        return autopilot_message(now_ns, unix_ns, self._link, witness, self._sources.on_vision)
 
     def _switch_sources(self, consistency: Consistency, now_ns: int) -> None:
         """Command the autopilot's source set where that was enabled; announce what it took."""

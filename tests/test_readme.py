@@ -1,6 +1,8 @@
 """What the README and the example configuration promise must be what is there."""
 
+import importlib.util
 import re
+import typing
 from pathlib import Path
 
 import msgspec
@@ -37,6 +39,83 @@ def test_every_command_that_the_readme_names_exists():
     named = set(re.findall(r"`ortholoc-edge ([\w-]+)", text))
     assert named <= set(actions.choices)
     assert set(actions.choices) <= named | {"sim"}
+
+
+DOCUMENTS = sorted(
+    path
+    for folder in (".", "docs", "docs/studies", "config", "systemd", "tiles")
+    for path in (ROOT / folder).glob("*.md")
+)
+
+
+def code_of(document: Path) -> list[str]:
+    """What is code: lines of blocks, those joined that go on, and spans of prose, which may go over a line's end."""
+    text = document.read_text(encoding="utf-8")
+    blocks = re.findall(r"^```\w*\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE)
+    prose = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    return lines + [span.replace("\n", " ") for span in re.findall(r"`([^`]+)`", prose)]
+
+
+def test_commands_and_options_that_the_documents_name_exist():
+    top = _parser()
+    found = 0
+    for document in DOCUMENTS:
+        for line in code_of(document):
+            # Up to a comment, or where another program begins.
+            for words in re.findall(r"\bortholoc-edge((?: [^#;&|>]*)?)", line):
+                parser, rest = top, words.split()
+                while rest and (choices := subcommands(parser)):
+                    while rest[0].startswith("-"):
+                        assert rest[0] in parser._option_string_actions, f"{document.name}: {line}"
+                        rest.pop(0)
+                    if not re.fullmatch(r"[a-z][\w-]*", rest[0]):
+                        break
+                    assert rest[0] in choices, f"{document.name}: there is no {rest[0]}: {line}"
+                    parser = choices[rest.pop(0)]
+                options = [word.split("=")[0].rstrip(",.:)") for word in rest if word.startswith("--")]
+                found += len(options)
+                for option in options:
+                    assert option in parser._option_string_actions, f"{document.name}: there is no {option}: {line}"
+    assert found > 50
+
+
+def subcommands(parser) -> dict:
+    return next((a.choices for a in parser._actions if hasattr(a, "choices") and isinstance(a.choices, dict)), {})
+
+
+def test_scripts_and_modules_that_the_documents_name_exist():
+    found = 0
+    for document in DOCUMENTS:
+        for line in code_of(document):
+            for module in re.findall(r"python3? -m (ortholoc_\w+(?:\.\w+)*)", line):
+                assert importlib.util.find_spec(module) is not None, f"{document.name}: there is no {module}"
+                found += 1
+            for script in re.findall(r"python3? ([\w/]+\.py)", line):
+                assert (ROOT / script).is_file(), f"{document.name}: there is no {script}"
+                found += 1
+    assert found > 10
+
+
+def test_configuration_keys_that_the_documents_name_exist():
+    """``[table] key``, ``[table.part] key`` and ``table.key`` of tables that there are."""
+    found = 0
+    for document in DOCUMENTS:
+        if document.name == "simulation.md":
+            continue  # its tables are those of scenarios
+        for line in code_of(document):
+            # `link.fusion`, `camera.frames` and the like are statistics, and `page.js` is a file.
+            named = re.fullmatch(r"\[([\w.]+)\] (\w+)(?: = .*)?", line) or re.fullmatch(
+                r"(?!link\.|camera\.)([a-z]\w*(?:\.\w+)*)\.(?!(?:js|py|toml)\b)(\w+)", line
+            )
+            if named is None or named[1].split(".")[0] not in config.Config.__struct_fields__:
+                continue
+            kind: typing.Any = config.Config
+            for part in [*named[1].split("."), named[2]]:
+                assert part in kind.__struct_fields__, f"{document.name}: there is no {line}"
+                kind = typing.get_type_hints(kind)[part]
+            found += 1
+    assert found > 15
 
 
 def test_links_of_the_documents_lead_somewhere():

@@ -17,7 +17,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -123,8 +123,7 @@ class Line:
                 grey = np.ascontiguousarray(grey[:, ::-1])
             if self.dull:
                 grey = dulled(grey, self.dull, self.number, k)
-            assert self.localizer._tracking
-            self._fields[k] = self.localizer._tracking[0].fields(grey)
+            self._fields[k] = _maker(self.localizer).fields(grey)
         return self._fields[k]
 
     def leg_variance(self, j: int, k: int) -> float:
@@ -234,13 +233,19 @@ def _predicted(truths: list[Rigid3], height_m: float, rng: np.random.Generator) 
     return poses
 
 
+def _maker(localizer: Localizer) -> structural.QueryMaker:
+    tracking = localizer._details[0].tracking
+    assert tracking is not None
+    return tracking
+
+
 def terrain_of(localizer: Localizer, priors: list[PosePrior]) -> tuple[LocalFrame, Terrain]:
     """Of all the views. Raises: RejectedError."""
     grounds = [localizer._predicted_ground(prior) for prior in priors]
     bounds = np.array([search_bounds(o, p, g, 2.5) for p, (g, o) in zip(priors, grounds, strict=True)])
     west, south, east, north = *bounds[:, :2].min(axis=0), *bounds[:, 2:].max(axis=0)
     ground_m = grounds[-1][0]
-    gsd_m = localizer._distance_to_ground(priors[-1], ground_m) / localizer._tracking[0].finest.focal_px
+    gsd_m = localizer._distance_to_ground(priors[-1], ground_m) / _maker(localizer).finest.focal_px
     window = localizer._read((float(west), float(south), float(east), float(north)), gsd_m)
     local = localizer._local_frame(window, ground_m)
     terrain = Terrain.of(window, precondition.grey_map(window), local)
@@ -643,21 +648,21 @@ class Chain:
 def _localized(line: Line, k: int, prior: PosePrior) -> object:
     """Of the localizer as it flies; the picture's fields are those of the line."""
     localizer = line.localizer
-    makers = localizer._tracking
+    details, maker = localizer._details, _maker(localizer)
     ready = line.fields(k)
 
     class Ready:
-        finest, tuning = makers[0].finest, makers[0].tuning
+        finest, tuning = maker.finest, maker.tuning
 
         def fields(self, grey: ImageArray) -> structural.QueryFields:
             return ready
 
-    localizer._tracking = [Ready()]  # type: ignore[list-item]
+    localizer._details = [replace(details[0], tracking=Ready())]  # type: ignore[arg-type]
     try:
         empty = np.zeros((localizer.camera.height, localizer.camera.width), np.uint8)
         return localizer.localize(Frame(0, empty, str(k)), prior)
     finally:
-        localizer._tracking = makers
+        localizer._details = details
 
 
 VARIANTS = {

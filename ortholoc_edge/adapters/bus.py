@@ -29,13 +29,9 @@ from ortholoc_edge.adapters.messages import (
     JSON,
     MSGPACK,
     PUBLISHED,
-    AutopilotMessage,
     Command,
     CommandReply,
-    FixMessage,
-    HealthMessage,
-    RejectionMessage,
-    StateMessage,
+    Published,
 )
 from ortholoc_edge.errors import ConfigError, LinkError
 from ortholoc_edge.geometry.arrays import ImageArray
@@ -235,7 +231,7 @@ class Bus:
 
     # -- what is published: the owner's thread -----------------------------------------------------------
 
-    def publish(self, message: FixMessage | RejectionMessage | StateMessage | HealthMessage | AutopilotMessage) -> None:
+    def publish(self, message: Published) -> None:
         """Send it to whoever listens. A failure is counted and logged, never raised: the flight goes on."""
         if self._options.encoding == "json":
             payload, encoding = msgspec.json.encode(message), JSON

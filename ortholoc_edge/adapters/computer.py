@@ -10,6 +10,9 @@ from pathlib import Path
 
 # Bits of the Raspberry Pi's get_throttled that are true now; from bit 16 on they say "since the start".
 _PI_UNDER_VOLTAGE, _PI_FREQUENCY_CAPPED, _PI_THROTTLED, _PI_SOFT_LIMIT = 1, 2, 4, 8
+# Parts of thermal zones' names on a Raspberry Pi (cpu-thermal), a Jetson (CPU-therm, cpu-thermal, soc0-thermal), other
+# ARM boards and x86 (x86_pkg_temp).
+_PROCESSOR_ZONES = ("cpu", "soc", "pkg")
 _PI_THROTTLED_FILE = "sys/devices/platform/soc/soc:firmware/get_throttled"
 
 
@@ -22,6 +25,8 @@ class ComputerStatus:
         memory_used_mib, memory_total_mib: used is what can't be had without swapping.
         temperatures_c: of the thermal zones that can be read, in their order.
         is_under_voltage, is_throttled, is_hot: as the board says it now; False where it says nothing.
+        processor_c: of the hottest zone that is the processor's by its name; None where none is. Other zones may be hot
+            for good (Jetsons have one that always says 100 degrees).
     """
 
     cpu_percent: tuple[float, ...]
@@ -31,6 +36,12 @@ class ComputerStatus:
     is_under_voltage: bool
     is_throttled: bool
     is_hot: bool
+    processor_c: float | None = None
+
+    @property
+    def load_percent(self) -> float | None:
+        """Of all cores together; None at the first reading."""
+        return sum(self.cpu_percent) / len(self.cpu_percent) if self.cpu_percent else None
 
 
 def parse_cpu_times(stat: str) -> dict[str, tuple[int, int]]:
@@ -103,18 +114,28 @@ class ComputerReader:
         busy = cpu_percent(self._times, times)
         self._times = times
         used, total = parse_memory_mib(self._text("proc/meminfo"))
-        zones = (parse_temperature_c(text) for text in self._texts("sys/class/thermal", "thermal_zone*/temp"))
+        zones = self._temperatures_c()
         under_voltage, throttled, hot = parse_pi_throttled(self._text(_PI_THROTTLED_FILE))
         slowed = self._is_cpu_slowed_for_heat()
         return ComputerStatus(
             busy,
             used,
             total,
-            tuple(value for value in zones if value is not None),
+            tuple(celsius for _, celsius in zones),
             under_voltage or any(text.strip() == "1" for text in self._texts("sys/class/hwmon", "*/in0_lcrit_alarm")),
             throttled or slowed,
             hot or slowed,
+            max((celsius for kind, celsius in zones if any(name in kind for name in _PROCESSOR_ZONES)), default=None),
         )
+
+    def _temperatures_c(self) -> list[tuple[str, float]]:
+        """The zones' kinds, in small letters, and what they say."""
+        found = []
+        for zone in sorted((self._root / "sys/class/thermal").glob("thermal_zone*")):
+            celsius = parse_temperature_c(self._text_of(zone / "temp"))
+            if celsius is not None:
+                found.append((self._text_of(zone / "type").lower(), celsius))
+        return found
 
     def _is_cpu_slowed_for_heat(self) -> bool:
         """Whether the kernel's thermal governor holds a CPU's clock down: its cooling device is not at zero."""

@@ -6,6 +6,7 @@
     /ortholoc/frame      ortholoc.Frame             what the step to the outcome depended on, and the outcome
     /ortholoc/outcome    ortholoc.Outcome           as published: a fix that came too late is a rejection here
     /ortholoc/health     ortholoc.Health            counters, once a second
+    /ortholoc/ladder     ortholoc.Ladder            steps to less detail or fewer frames, and back
     /ortholoc/command    ortholoc.Command           what others asked for; what the tracker takes of it is in the frames
 
 A thread of its own writes: the frame path never waits for it. Each file is whole by itself and begins with a metadata
@@ -36,7 +37,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from ortholoc_edge import __version__
-from ortholoc_edge.adapters.messages import Command, CommandReply
+from ortholoc_edge.adapters.messages import Command, CommandReply, LadderMessage
 from ortholoc_edge.geometry import covariance as cov
 from ortholoc_edge.geometry import frames, rotation
 from ortholoc_edge.geometry.arrays import ImageArray
@@ -211,6 +212,10 @@ class FlightLog:
         """Hand over the counters; returns at once."""
         content = {"stamp_ns": stamp_ns, "statistics": statistics}
         self._hand_over(_Note("health", stamp_ns, msgspec.json.encode(content)))
+
+    def ladder(self, message: LadderMessage) -> None:
+        """Hand over a step; returns at once. For people: a replay has the rung of each frame."""
+        self._hand_over(_Note("ladder", message.stamp_ns, msgspec.json.encode(message)))
 
     def command(self, stamp_ns: int, command: Command, reply: CommandReply) -> None:
         """Hand over what somebody asked for; returns at once. For people: a replay has it from the frames."""
@@ -529,6 +534,7 @@ _CHANNELS: dict[str, tuple[str, str, dict[str, Any]]] = {
         ),
     ),
     "health": ("/ortholoc/health", "ortholoc.Health", _object(stamp_ns=_INTEGER, statistics={"type": "object"})),
+    "ladder": ("/ortholoc/ladder", "ortholoc.Ladder", msgspec.json.schema(LadderMessage)),
     "command": (
         "/ortholoc/command",
         "ortholoc.Command",

@@ -102,7 +102,7 @@ class StateMessage(Struct, frozen=True, kw_only=True):
     Attributes:
         status: "track", "coast" or "search". paused: by command; then no frame is localized.
         last_fix_age_s: None before the first. last_reason: why the last frame was rejected; None if it was a fix.
-        rung: of detail, 0 is all of it. reset_counter: as told to the autopilot.
+        rung: 0 is all detail and all frames, see `LadderMessage`. reset_counter: as told to the autopilot.
         gnss: "ok", "suspect", "bad" or "unknown": whether it agrees with the fixes.
         autopilot: whether its heart beats. commands: whether any is accepted.
     """
@@ -182,6 +182,27 @@ class AutopilotMessage(Struct, frozen=True, kw_only=True):
     latency_p99_ms: float | None
     delay_advice: str | None
     on_vision: bool
+
+
+class LadderMessage(Struct, frozen=True, kw_only=True):
+    """``…/ladder``: a step to less detail or fewer frames, or back, when it is taken.
+
+    Attributes:
+        rung, was: now and before; 0 is all detail and all frames. rungs: how many there are, the first ``details`` of
+            which are of detail, the others of rate.
+        rate_hz: how many frames a second are localized at most; None: all that there is time for.
+        cause: "time", "load", "heat", "room" (for more), "reload". why: the same for people, with the numbers.
+    """
+
+    stamp_ns: int
+    unix_ns: int
+    rung: int
+    was: int
+    rungs: int
+    details: int
+    rate_hz: float | None
+    cause: str
+    why: str
 
 
 class ConfigMessage(Struct, frozen=True, kw_only=True):
@@ -268,7 +289,9 @@ PUBLISHED: dict[str, type[Struct]] = {
     "state": StateMessage,
     "health": HealthMessage,
     "autopilot": AutopilotMessage,
+    "ladder": LadderMessage,
 }
+Published = FixMessage | RejectionMessage | StateMessage | HealthMessage | AutopilotMessage | LadderMessage
 ASKED: dict[str, type[Struct]] = {"config": ConfigMessage, "stats": StatsMessage}
 COMMANDS: dict[str, type[Command]] = {
     "relocalize": Relocalize,

@@ -19,7 +19,7 @@ EXIT_CONFIG = 78  # EX_CONFIG: systemd's RestartPreventExitStatus, a restart can
 _COMMANDS = (
     "sim", "run", "doctor", "bus", "check-config", "install-service", "replay", "localize", "calibrate-focal",
     "tiles", "models", "samples", "bench", "bench-replay", "bench-core", "bench-link", "bench-bus", "bench-packs",
-    "bench-service", "profile",
+    "bench-service", "bench-start", "profile",
 )  # fmt: skip
 
 

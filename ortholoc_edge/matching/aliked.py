@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Final
 
 import cv2
@@ -10,7 +11,7 @@ import numpy as np
 from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
 from ortholoc_edge.matching.inference import Inference
 from ortholoc_edge.matching.types import Features
-from ortholoc_edge.matching.working_image import check_numbers, working_image
+from ortholoc_edge.matching.working_image import check_numbers, reduced_size, working_image
 from ortholoc_edge.matching.xfeat import MULTIPLE_PX, working_size
 
 DESCRIPTOR: Final = 128
@@ -111,16 +112,22 @@ class AlikedExtractor:
         threads: int = 1,
     ) -> None:
         check_numbers("ALIKED", MULTIPLE_PX, 2 * MULTIPLE_PX, working_px, max_keypoints, threads)
-        self._working_px = working_px
+        self.working_px = working_px
         self._max_keypoints = max_keypoints
         self._network = AlikedNetwork(picture, descriptors, threads)
+
+    def reduced(self, scale: float) -> AlikedExtractor:
+        """See `ReducibleMatcher`."""
+        other = copy.copy(self)
+        other.working_px, other._max_keypoints = reduced_size(self.working_px, self._max_keypoints, scale, MULTIPLE_PX)
+        return other
 
     def extract(self, image: ImageArray, valid: BoolArray | None = None) -> Features:
         """Features of ``image`` (H, W) uint8 grey; none within 8 working pixels of where ``valid`` is False.
 
         Raises: ModelError if an inference fails; ValueError if image or mask have another type or shape.
         """
-        work = working_image(image, valid, *working_size(image.shape, self._working_px))
+        work = working_image(image, valid, *working_size(image.shape, self.working_px))
         if work is None:
             return Features.none(DESCRIPTOR)
         features, scores = self._network.run(work.image)

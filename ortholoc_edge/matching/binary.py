@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -12,7 +13,7 @@ import numpy.typing as npt
 from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, ImageArray
 from ortholoc_edge.matching.nearest import mutual_nearest
 from ortholoc_edge.matching.types import Features, Matches
-from ortholoc_edge.matching.working_image import MIN_SIDE_PX, shrunk_image
+from ortholoc_edge.matching.working_image import MIN_SIDE_PX, reduced_size, shrunk_image
 
 _ANY_COSINE: Final = -1.0
 # Grey levels. Right matches (5 px of the truth) on the samples seneca, caliterra, demo, copr at 640 px: 18, 206, 56,
@@ -57,6 +58,12 @@ class BinaryMatcher:
         self._max_keypoints = max_keypoints
         self._ratio = ratio
         self._bits = 8 * int(self._detector(1).descriptorSize())
+
+    def reduced(self, scale: float) -> BinaryMatcher:
+        """See `ReducibleMatcher`."""
+        other = copy.copy(self)
+        other.working_px, other._max_keypoints = reduced_size(self.working_px, self._max_keypoints, scale)
+        return other
 
     def extract(self, image: ImageArray, valid: BoolArray | None = None) -> Features:
         """Features of ``image`` (H, W) uint8 grey; none within 8 working pixels of where ``valid`` is False.

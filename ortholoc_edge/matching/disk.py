@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Final
 
 import cv2
@@ -10,7 +11,7 @@ import numpy as np
 from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, ImageArray, IntArray
 from ortholoc_edge.matching.inference import Inference
 from ortholoc_edge.matching.types import Features
-from ortholoc_edge.matching.working_image import WorkingImage, check_numbers, working_image
+from ortholoc_edge.matching.working_image import WorkingImage, check_numbers, reduced_size, working_image
 from ortholoc_edge.matching.xfeat import parabola_offsets, working_size
 
 DESCRIPTOR: Final = 128
@@ -94,9 +95,15 @@ class DiskExtractor:
         threads: int = 1,
     ) -> None:
         check_numbers("DISK", MULTIPLE_PX, 2 * MULTIPLE_PX, working_px, max_keypoints, threads)
-        self._working_px = working_px
+        self.working_px = working_px
         self._max_keypoints = max_keypoints
         self._network = DiskNetwork(picture, descriptors, threads)
+
+    def reduced(self, scale: float) -> DiskExtractor:
+        """See `ReducibleMatcher`."""
+        other = copy.copy(self)
+        other.working_px, other._max_keypoints = reduced_size(self.working_px, self._max_keypoints, scale, MULTIPLE_PX)
+        return other
 
     def extract(self, image: ImageArray, valid: BoolArray | None = None) -> Features:
         """Features of ``image`` (H, W) uint8 grey; none within 8 working pixels of where ``valid`` is False.
@@ -106,7 +113,7 @@ class DiskExtractor:
         from 0.97, 1.13, 0.91 and 1.60 to 0.82, 0.97, 0.76 and 1.35 px.
         Raises: ModelError if an inference fails; ValueError if image or mask have another type or shape.
         """
-        work = working_image(image, valid, *working_size(image.shape, self._working_px, MULTIPLE_PX))
+        work = working_image(image, valid, *working_size(image.shape, self.working_px, MULTIPLE_PX))
         if work is None:
             return Features.none(DESCRIPTOR)
         features, heat = self._network.run(work.image)

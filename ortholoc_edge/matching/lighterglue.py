@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Final, Protocol
@@ -52,6 +53,10 @@ class GlueNetwork:
 class Extractor(Protocol):
     """Of a matcher's features."""
 
+    working_px: int
+
+    def reduced(self, scale: float) -> Extractor: ...
+
     def extract(self, image: ImageArray, valid: BoolArray | None = None) -> Features: ...
 
 
@@ -82,6 +87,13 @@ class GlueMatcher:
         self.working_px = working_px
         self._extractor = extractor
         self._network = GlueNetwork(*network, threads, name)
+
+    def reduced(self, scale: float) -> GlueMatcher:
+        """See `ReducibleMatcher`."""
+        other = copy.copy(self)
+        other._extractor = self._extractor.reduced(scale)
+        other.working_px = other._extractor.working_px
+        return other
 
     def extract(self, image: ImageArray, valid: BoolArray | None = None) -> Features:
         """As the extractor's, with the image's size."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Final
 
 import cv2
@@ -10,7 +11,7 @@ import numpy as np
 from ortholoc_edge.geometry.arrays import BoolArray, ImageArray
 from ortholoc_edge.matching.nearest import mutual_nearest
 from ortholoc_edge.matching.types import Features, Matches
-from ortholoc_edge.matching.working_image import MIN_SIDE_PX, shrunk_image
+from ortholoc_edge.matching.working_image import MIN_SIDE_PX, reduced_size, shrunk_image
 
 _DESCRIPTOR: Final = 128
 _ANY_COSINE: Final = -1.0
@@ -42,6 +43,12 @@ class SiftMatcher:
         self.working_px = working_px
         self._max_keypoints = max_keypoints
         self._ratio = ratio
+
+    def reduced(self, scale: float) -> SiftMatcher:
+        """See `ReducibleMatcher`."""
+        other = copy.copy(self)
+        other.working_px, other._max_keypoints = reduced_size(self.working_px, self._max_keypoints, scale)
+        return other
 
     def extract(self, image: ImageArray, valid: BoolArray | None = None) -> Features:
         """Features of ``image`` (H, W) uint8 grey; none within 8 working pixels of where ``valid`` is False.

@@ -3,6 +3,7 @@ matches them."""
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import Final
 
@@ -15,7 +16,7 @@ from ortholoc_edge.matching.inference import Inference
 from ortholoc_edge.matching.lighterglue import GlueMatcher, mutual_best
 from ortholoc_edge.matching.models import joint_sha256
 from ortholoc_edge.matching.types import Features, Matcher, Matches
-from ortholoc_edge.matching.working_image import check_numbers, working_image
+from ortholoc_edge.matching.working_image import check_numbers, reduced_size, working_image
 
 DESCRIPTOR: Final = 256
 CELL_PX: Final = 8
@@ -56,12 +57,18 @@ class SuperPointExtractor:
     ) -> None:
         check_numbers("SuperPoint", CELL_PX, 4 * CELL_PX, working_px, max_keypoints, threads)
         self._min_score = min_score
-        self._working_px = working_px
+        self.working_px = working_px
         self._max_keypoints = max_keypoints
         self._inference = Inference(
             graph.path, graph.sha256, threads, what="SuperPoint", model=model, inputs=["picture"],
             outputs=["heat", "descriptors"],
         )  # fmt: skip
+
+    def reduced(self, scale: float) -> SuperPointExtractor:
+        """See `ReducibleMatcher`."""
+        other = copy.copy(self)
+        other.working_px, other._max_keypoints = reduced_size(self.working_px, self._max_keypoints, scale, CELL_PX)
+        return other
 
     def extract(self, image: ImageArray, valid: BoolArray | None = None) -> Features:
         """Features of ``image`` (H, W) uint8 grey, with its size; none within 8 working pixels of where ``valid`` is
@@ -70,7 +77,7 @@ class SuperPointExtractor:
         Raises: ModelError if the inference fails; ValueError if image or mask have another type or shape.
         """
         rows, columns = image.shape[:2]
-        scale = self._working_px / max(rows, columns, 1)
+        scale = self.working_px / max(rows, columns, 1)
         width, height = (max(1, round(side * scale / CELL_PX)) * CELL_PX for side in (columns, rows))
         work = working_image(image, valid, width, height)
         pixels, scores = np.empty((0, 2)), np.empty(0, np.float32)
@@ -168,6 +175,13 @@ class SuperGlueMatcher:
             graph.path, graph.sha256, threads, what="SuperGlue", model="superpoint-superglue", inputs=self._inputs,
             outputs=["log_assignment"],
         )  # fmt: skip
+
+    def reduced(self, scale: float) -> SuperGlueMatcher:
+        """See `ReducibleMatcher`."""
+        other = copy.copy(self)
+        other._extractor = self._extractor.reduced(scale)
+        other.working_px = other._extractor.working_px
+        return other
 
     def extract(self, image: ImageArray, valid: BoolArray | None = None) -> Features:
         return self._extractor.extract(image, valid)

@@ -105,6 +105,16 @@ class UnscaledMatcher(Matcher, Protocol):
         ...
 
 
+@runtime_checkable
+class ReducibleMatcher(Matcher, Protocol):
+    """A matcher whose resolution can be chosen."""
+
+    def reduced(self, scale: float) -> Matcher:
+        """The same at so much of its ``working_px``, as near as its network allows, and of its keypoints in proportion
+        to the area. Networks are shared: it takes no memory."""
+        ...
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Structural:
     """Not local features, but the edges of the whole picture against the map drawn in the predicted view; needs no

@@ -21,6 +21,8 @@ MIN_CONTRAST: Final = 0.5
 # descriptor map. The receptive field is wider, but the fill is the mean grey, and a wider margin would
 # empty maps with scattered holes.
 INVALID_MARGIN_PX: Final = 8
+# Long side that no matcher is reduced below: the smallest that can be configured.
+LEAST_REDUCED_PX: Final = 128
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,6 +82,12 @@ def check_numbers(
             f"{what}: working_px {working_px} must be a multiple of {multiple_px} from {least_px} on, "
             f"max_keypoints {max_keypoints} and threads {threads} at least 1"
         )
+
+
+def reduced_size(working_px: int, max_keypoints: int, scale: float, multiple_px: int = 1) -> tuple[int, int]:
+    """Both at a part of the resolution; the long side a multiple of ``multiple_px``, not below `LEAST_REDUCED_PX`."""
+    px = max(min(working_px, LEAST_REDUCED_PX), round(working_px * scale / multiple_px) * multiple_px)
+    return px, max(1, round(max_keypoints * scale**2))
 
 
 def working_image(image: ImageArray, valid: BoolArray | None, width: int, height: int) -> WorkingImage | None:

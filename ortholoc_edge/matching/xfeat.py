@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Final
 
 import cv2
@@ -11,7 +12,7 @@ from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, I
 from ortholoc_edge.matching.inference import Inference
 from ortholoc_edge.matching.nearest import mutual_nearest
 from ortholoc_edge.matching.types import Features, Matches
-from ortholoc_edge.matching.working_image import WorkingImage, check_numbers, working_image
+from ortholoc_edge.matching.working_image import WorkingImage, check_numbers, reduced_size, working_image
 
 _INPUT: Final = "normalised"
 _OUTPUTS: Final = ["features", "heat", "reliability"]
@@ -86,6 +87,12 @@ class XFeatMatcher:
         self._max_keypoints = max_keypoints
         self._min_cosine = min_cosine
         self._network = XFeatNetwork(model_bytes, sha256, threads)
+
+    def reduced(self, scale: float) -> XFeatMatcher:
+        """See `ReducibleMatcher`."""
+        other = copy.copy(self)
+        other.working_px, other._max_keypoints = reduced_size(self.working_px, self._max_keypoints, scale, MULTIPLE_PX)
+        return other
 
     def extract(self, image: ImageArray, valid: BoolArray | None = None) -> Features:
         """Features of ``image`` (H, W) uint8 grey; none within 8 working pixels of where ``valid`` is False.

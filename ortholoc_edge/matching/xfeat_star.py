@@ -7,6 +7,7 @@ descriptors and says where in the first image's cell the place is.
 
 from __future__ import annotations
 
+import copy
 from typing import Final
 
 import numpy as np
@@ -16,7 +17,7 @@ from ortholoc_edge.matching.inference import Inference
 from ortholoc_edge.matching.models import joint_sha256
 from ortholoc_edge.matching.nearest import mutual_nearest
 from ortholoc_edge.matching.types import Features, Matches
-from ortholoc_edge.matching.working_image import WorkingImage, check_numbers, working_image
+from ortholoc_edge.matching.working_image import WorkingImage, check_numbers, reduced_size, working_image
 from ortholoc_edge.matching.xfeat import CELL_PX, DESCRIPTOR, MULTIPLE_PX, normalised, working_size
 
 _INPUT: Final = "normalised"
@@ -97,6 +98,12 @@ class XFeatStarMatcher:
         self._max_keypoints = max_keypoints
         self._dense = DenseNetwork(*dense, threads)
         self._fine = FineNetwork(*fine, threads)
+
+    def reduced(self, scale: float) -> XFeatStarMatcher:
+        """See `ReducibleMatcher`."""
+        other = copy.copy(self)
+        other.working_px, other._max_keypoints = reduced_size(self.working_px, self._max_keypoints, scale, MULTIPLE_PX)
+        return other
 
     def extract(self, image: ImageArray, valid: BoolArray | None = None) -> Features:
         """Cells of ``image`` (H, W) uint8 grey; none that lies, or is within 8 pixels of its level, where ``valid``

@@ -19,7 +19,15 @@ from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.grid import resize_px
 from ortholoc_edge.matching.adhop import fit_homography
-from ortholoc_edge.matching.types import AnyMatcher, Features, Matcher, Matches, Structural, UnscaledMatcher
+from ortholoc_edge.matching.types import (
+    AnyMatcher,
+    Features,
+    Matcher,
+    Matches,
+    ReducibleMatcher,
+    Structural,
+    UnscaledMatcher,
+)
 from ortholoc_edge.pipeline import gate, precondition, structural, surface
 from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
@@ -56,6 +64,8 @@ _GROUND_GSD_M = 4.0
 # A map picture finer than the frame is no use; a coarser one than this is hard to match (field-notes, scale).
 _MAX_COARSENING = 3.0
 _UNSTATED_SIGMA_PX = 0.5
+# Of the resolution of a matcher of features, on the rungs of its ladder; what XFeat loses by it: docs/profile.md.
+FEATURE_SCALES = (1.0, 0.75, 0.5)
 # Of one frame the principal point can't be told from the tilt; `calibrate-focal` has many.
 _ONLY_FOCAL = calibrate.Unknowns(principal_point_sigma=0.0)
 # Part of the gate's least number and ratio of inliers that a round with stored features needs before the last, which
@@ -102,6 +112,24 @@ class _MapScene:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Detail:
+    """With what frames are localized on one rung.
+
+    Attributes:
+        tracking: structural matching's part; None: not wanted.
+        acquire: matcher of features; None: structural matching alone.
+        working: pinhole camera of the size at which the matcher sees the frame; views of the map are drawn at the same
+            size.
+        stored: with the pack's features, where it has some that fit the matcher and they are wanted.
+    """
+
+    tracking: structural.QueryMaker | None
+    acquire: Matcher | None
+    working: Camera
+    stored: StoredMatching | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Matched:
     """A frame's matches with the map.
 
@@ -130,52 +158,71 @@ class Localizer:
     ) -> None:
         """
         Args:
-            ladder: of structural matching: what `localize` may be told to do with, full detail first.
+            ladder: of structural matching: what `localize` may be told to do with, full detail first. A matcher of
+                features has `FEATURE_SCALES`, unless its network has a size of its own.
         """
         self.camera = camera
-        self._acquire = matcher.acquire if isinstance(matcher, Structural) else matcher
-        if options.calibrate and self._acquire is None:
+        acquire = matcher.acquire if isinstance(matcher, Structural) else matcher
+        if options.calibrate and acquire is None:
             raise ConfigError(
                 "structural matching takes the focal length as it is; to calibrate name a matcher of features, say "
                 "xfeat"
             )
-        tracks = isinstance(matcher, Structural) and not options.calibrate
-        self._tracking = [structural.QueryMaker(camera, tuning) for tuning in ladder] if tracks else []
         self._store = store
         self._options = options
         self._max_error_px = pnp.threshold_px(camera)
-        working_px = ladder[0].levels[-1].long_px if self._acquire is None else self._acquire.working_px
-        scale = min(1.0, working_px / max(camera.width, camera.height))
-        # The size at which the matcher sees the frame; views of the map are drawn at the same size.
-        self._working = camera.pinhole().resized(
-            max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
-        )
         self._map_covariance = _map_covariance(store.pack.manifest)
         # The frame's features are extracted while the map's part is read, warped and extracted.
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="query-features")
-        self._stored = self._stored_matching()
+        tracks = isinstance(matcher, Structural) and not options.calibrate
+        tracking = [structural.QueryMaker(camera, tuning) for tuning in ladder] if tracks else []
+        self._details = self._made_details(tracking, ladder[0].levels[-1].long_px, acquire)
+        # That of the frame at hand.
+        self._detail = self._details[0]
 
-    def _stored_matching(self) -> StoredMatching | None:
-        """With the pack's features, where it has some that fit the matcher and they are wanted.
+    def _made_details(
+        self, tracking: list[structural.QueryMaker], structural_px: int, acquire: Matcher | None
+    ) -> list[_Detail]:
+        """Raises: MapError if stored features are required and there are none."""
+        index = self._feature_index(acquire)
+        scales = FEATURE_SCALES if isinstance(acquire, ReducibleMatcher) else (1.0,)
+        details = []
+        for rung in range(len(tracking) or len(scales)):
+            scale = scales[min(rung, len(scales) - 1)]
+            matcher = acquire.reduced(scale) if scale < 1.0 and isinstance(acquire, ReducibleMatcher) else acquire
+            working = self._working_camera(structural_px if matcher is None else matcher.working_px)
+            stored = None
+            if index is not None:
+                assert isinstance(matcher, UnscaledMatcher), "the index checks it"
+                stored = StoredMatching(self.camera, working, matcher, self._store, index, self._judged)
+            details.append(_Detail(tracking[rung] if tracking else None, matcher, working, stored))
+        return details
+
+    def _working_camera(self, working_px: int) -> Camera:
+        scale = min(1.0, working_px / max(self.camera.width, self.camera.height))
+        return self.camera.pinhole().resized(
+            max(1, round(self.camera.width * scale)), max(1, round(self.camera.height * scale))
+        )
+
+    def _feature_index(self, acquire: Matcher | None) -> FeatureIndex | None:
+        """Of the pack's features, where it has some that fit the matcher and they are wanted.
 
         Raises: MapError if they are required and there are none.
         """
         wanted = self._options.precomputed_features
         if wanted == "never" or (wanted == "auto" and self._store.pack.manifest.features is None):
             return None
-        if self._acquire is None:
+        if acquire is None:
             if wanted == "require":
                 raise MapError("structural matching has no use for stored features; name a matcher of features, too")
             return None
         try:
-            index = FeatureIndex(self._store, self.matcher)
+            return FeatureIndex(self._store, acquire)
         except MapError as error:
             if wanted == "require":
                 raise
             logger.warning("%s; the network looks at the map instead", error)
             return None
-        assert isinstance(self.matcher, UnscaledMatcher), "the index checks it"
-        return StoredMatching(self.camera, self._working, self.matcher, self._store, index, self._judged)
 
     def close(self) -> None:
         self._worker.shutdown()
@@ -193,27 +240,32 @@ class Localizer:
         # stay in memory (3 MB) for this alone. The factor is 2^32 over the golden ratio: a multiplicative hash.
         pixels = np.arange(self.camera.height * self.camera.width, dtype=np.uint32) ** 2 * np.uint32(2654435769)
         picture = (pixels >> np.uint32(24)).astype(np.uint8).reshape(self.camera.height, self.camera.width)
-        for tracking in self._tracking:
-            tracking.fields(picture)
-        if self._acquire is not None:
-            features = self._acquire.extract(picture)
-            self._acquire.match(features, features)
+        for detail in self._details:
+            if detail.tracking is not None:
+                detail.tracking.fields(picture)
+            if detail.acquire is not None:
+                features = detail.acquire.extract(picture)
+                detail.acquire.match(features, features)
 
     @property
     def matcher(self) -> Matcher:
         """Of features; structural matching alone never asks for it."""
-        assert self._acquire is not None, "a localizer without a matcher of features needs none"
-        return self._acquire
+        assert self._detail.acquire is not None, "a localizer without a matcher of features needs none"
+        return self._detail.acquire
+
+    @property
+    def _working(self) -> Camera:
+        return self._detail.working
 
     @property
     def rungs(self) -> int:
         """In how many ways, of less and less detail, a frame can be localized."""
-        return max(len(self._tracking), 1)
+        return len(self._details)
 
     @property
     def working_camera(self) -> Camera:
-        """Of the size at which frames are matched, without distortion."""
-        return self._working
+        """Of the size at which frames are matched in full detail, without distortion."""
+        return self._details[0].working
 
     def height_above_ground_m(self, prior: PosePrior) -> float | None:
         """Of the predicted camera over the surface around it; None where the map has none."""
@@ -236,8 +288,9 @@ class Localizer:
         Raises: ModelError if the matcher itself fails.
         """
         trace = Trace()
+        self._detail = self._details[rung]
         try:
-            return self._localize(frame, prior, proceed, rung, trace)
+            return self._localize(frame, prior, proceed, trace)
         except RejectedError as stop:
             return Rejected(frame.stamp_ns, stop.reason, stop.detail, stop.measured, stop.limit, trace.timings_ms())
         except WindowTooLargeError as error:
@@ -250,8 +303,9 @@ class Localizer:
         Raises: ModelError if the matcher itself fails.
         """
         trace = Trace()
+        self._detail = self._details[0]
         try:
-            query = self._worker.submit(self._query_features, self._checked_grey(frame), trace)
+            query = self._worker.submit(self._query_features, self.matcher, self._checked_grey(frame), trace)
             try:
                 scene, first = self._first_round(query, prior, lambda: True, trace)
                 second = self._second_round(first, query, scene, trace)
@@ -270,31 +324,32 @@ class Localizer:
         )
 
     def _localize(
-        self, frame: Frame, prior: PosePrior | RegionPrior, proceed: Callable[[], bool], rung: int, trace: Trace
+        self, frame: Frame, prior: PosePrior | RegionPrior, proceed: Callable[[], bool], trace: Trace
     ) -> Fix:
+        detail = self._detail
         grey = self._checked_grey(frame)
         only_stored = self._options.precomputed_features == "require"
-        if self._tracking and not only_stored:
+        if detail.tracking is not None and not only_stored:
             if not isinstance(prior, PosePrior):
                 refused = RejectedError(Reason.NO_PRIOR, "structural matching needs a predicted pose")
             else:
                 try:
                     with trace.stage("structural"):
-                        fix = self._by_structure(self._tracking[rung], frame, grey, prior, proceed, trace)
+                        fix = self._by_structure(detail.tracking, frame, grey, prior, proceed, trace)
                     return replace(fix, timings_ms=trace.timings_ms())
                 except RejectedError as error:
                     refused = error
-            if self._acquire is None or not proceed():
+            if detail.acquire is None or not proceed():
                 raise refused
-        if self._stored is not None and isinstance(prior, PosePrior):
+        if detail.stored is not None and isinstance(prior, PosePrior):
             try:
-                return self._by_stored_features(self._stored, frame, grey, prior, proceed, trace)
+                return self._by_stored_features(detail.stored, frame, grey, prior, proceed, trace)
             except RejectedError as error:
                 if only_stored or error.reason is Reason.LATE or not proceed():
                     raise
         elif only_stored:
             raise RejectedError(Reason.NO_PRIOR, "stored features need a predicted pose")
-        return self._by_network(frame, grey, prior, proceed, trace, self._tracking[rung] if self._tracking else None)
+        return self._by_network(frame, grey, prior, proceed, trace, detail.tracking)
 
     def _by_structure(
         self,
@@ -427,7 +482,7 @@ class Localizer:
         Args:
             tracking: to refine it by structural matching where that can be, in place of AdHoP.
         """
-        query = self._worker.submit(self._query_features, grey, trace)
+        query = self._worker.submit(self._query_features, self.matcher, grey, trace)
         try:
             scene, first = self._first_round(query, prior, proceed, trace)
             if tracking is not None and isinstance(prior, PosePrior):
@@ -459,9 +514,9 @@ class Localizer:
             return frame.image
         return np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
-    def _query_features(self, grey: ImageArray, trace: Trace) -> Features:
+    def _query_features(self, matcher: Matcher, grey: ImageArray, trace: Trace) -> Features:
         with trace.stage("query_features"):
-            return self.matcher.extract(grey)
+            return matcher.extract(grey)
 
     def _by_stored_features(
         self,

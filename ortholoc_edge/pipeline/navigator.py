@@ -10,7 +10,7 @@ from msgspec import Meta, Struct
 
 from ortholoc_edge.pipeline.frame import Frame, VehicleState
 from ortholoc_edge.pipeline.gate import GateOptions
-from ortholoc_edge.pipeline.ladder import Ladder
+from ortholoc_edge.pipeline.ladder import Ladder, LadderOptions
 from ortholoc_edge.pipeline.localizer import Localizer
 from ortholoc_edge.pipeline.outcome import Outcome, Rejected
 from ortholoc_edge.pipeline.picture import PictureOptions, Seen, Watch, grey_rows, motion_px_s, unfit
@@ -24,8 +24,8 @@ class TimingOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     ``max_age_ms``: from mid-exposure; what is older is not sent, and the search of a wide prior ends. ArduPilot takes
     data older than its buffer (250 ms and the delay it is told of) for newer than they are.
-    ``budget_ms``: of a frame; structural matching takes less detail where frames take longer (load, heat), and more
-    again when there is room. An autopilot wants five estimates in a second at least.
+    ``budget_ms``: of a frame; where frames take longer they are matched in less detail, and in more again when there is
+    room (`pipeline.ladder`). An autopilot wants five estimates in a second at least.
     """
 
     max_age_ms: Annotated[float, Meta(gt=0)] = 1000.0
@@ -47,7 +47,7 @@ class Circumstances:
     Attributes:
         number: of the step since the start, from 0; one that failed has used up its own.
         prior: the prediction; None where there was none.
-        rung: of detail.
+        rung: of detail, for `Localizer.localize`.
         proceeded: how often it was told to go on before it was told to stop, or did not ask any more.
         reset_counter: the tracker's before the step; others may raise it between steps.
         orders: what the tracker was told since the step before.
@@ -70,7 +70,7 @@ class Navigator:
 
     Attributes:
         localizer, tracker: the two.
-        ladder: how much detail there is time for.
+        ladder: how much detail, and how many frames, there is time for.
         last: what the last step depended on; None before the first.
     """
 
@@ -80,18 +80,20 @@ class Navigator:
         tracker: Tracker,
         budget_ms: float | None = None,
         picture: PictureOptions | None = None,
+        ladder: LadderOptions | None = None,
     ) -> None:
         """
         Args:
             budget_ms: wall time that a frame may take before detail is left out; None: any, so that a replay gives
                 the same on every machine.
             picture: what a frame must be to be matched; None: anything, as photos of a recorded sequence are.
+            ladder: what else detail and frames are left out for; None: the defaults.
         """
         self.localizer = localizer
         self.tracker = tracker
         self._picture = picture
         self._watch = Watch()
-        self.ladder = Ladder(localizer.rungs, budget_ms)
+        self.ladder = Ladder(localizer.rungs, budget_ms, ladder)
         self.last: Circumstances | None = None
         self._steps = 0
         self._orders: list[Order] = []
@@ -114,11 +116,12 @@ class Navigator:
 
     def step(self, frame: Frame, state: VehicleState, proceed: Callable[[], bool] = lambda: True) -> Outcome:
         """What the frame comes to, given the vehicle's state at its exposure. ``proceed``: see `Localizer.localize`."""
-        rung = self.ladder.rung
-        outcome = self._step(frame, state, proceed, rung)
-        # Only what a rung can change; and a frame that was refused before anything was matched took no time.
-        if "match" in outcome.timings_ms and "structural" in outcome.timings_ms:
-            self.ladder.note(outcome.timings_ms["structural"])
+        outcome = self._step(frame, state, proceed, self.ladder.detail)
+        took_ms = outcome.timings_ms
+        # A frame that was refused before anything was matched took no time. A search by features, for one that
+        # structural matching can't place, takes long on any rung.
+        if "match" in took_ms:
+            self.ladder.note(took_ms.get("structural", took_ms["total"]), frame.stamp_ns)
         return outcome
 
     def step_again(self, frame: Frame, state: VehicleState, was: Circumstances) -> Outcome:

@@ -62,6 +62,10 @@ def test_reader_takes_what_there_is(tmp_path):
             "proc/stat": STAT,
             "proc/meminfo": "MemTotal: 2048 kB\nMemAvailable: 1024 kB\n",
             "sys/class/thermal/thermal_zone0/temp": "61250\n",
+            "sys/class/thermal/thermal_zone0/type": "CPU-therm\n",
+            # As a Jetson has it: no sensor behind it.
+            "sys/class/thermal/thermal_zone2/temp": "100000\n",
+            "sys/class/thermal/thermal_zone2/type": "PMIC-Die\n",
             "sys/class/thermal/thermal_zone1/temp": "broken\n",
             "sys/class/thermal/cooling_device0/type": "cpufreq-cpu0\n",
             "sys/class/thermal/cooling_device0/cur_state": "0\n",
@@ -69,7 +73,11 @@ def test_reader_takes_what_there_is(tmp_path):
             "sys/class/thermal/cooling_device1/cur_state": "3\n",
         },
     )
-    assert reader.read() == ComputerStatus((), 1, 2, (61.25,), False, False, False)
+    assert reader.read() == ComputerStatus((), 1, 2, (61.25, 100.0), False, False, False, processor_c=61.25)
+    (tmp_path / "sys/class/thermal/thermal_zone0/type").write_text("acpitz\n")
+    assert reader.read().processor_c is None, "no zone says that it is the processor's"
+    (tmp_path / "sys/class/thermal/thermal_zone1/temp").write_text("48000\n")
+    (tmp_path / "sys/class/thermal/thermal_zone1/type").write_text("x86_pkg_temp\n")
     lay(
         tmp_path,
         {
@@ -78,7 +86,9 @@ def test_reader_takes_what_there_is(tmp_path):
             "sys/class/hwmon/hwmon1/in0_lcrit_alarm": "1\n",
         },
     )
-    assert reader.read() == ComputerStatus((75.0, 25.0), 1, 2, (61.25,), True, True, True)
+    status = reader.read()
+    assert status == ComputerStatus((75.0, 25.0), 1, 2, (61.25, 48.0, 100.0), True, True, True, processor_c=48.0)
+    assert status.load_percent == 50.0 and ComputerStatus((), 0, 0, (), False, False, False).load_percent is None
 
 
 def test_reader_on_this_machine():

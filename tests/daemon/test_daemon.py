@@ -16,6 +16,7 @@ import sys
 import threading
 import time
 import urllib.request
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
@@ -820,19 +821,74 @@ def test_slot_wakes_its_taker() -> None:
     assert time.monotonic() - started < 5.0
 
 
-def test_a_defect_of_the_reports_ends_no_flight(folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: Any) -> None:
+@pytest.mark.parametrize("part", ["_herald", "_computer"])
+def test_a_defect_of_the_reports_ends_no_flight(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: Any, part: str
+) -> None:
     """It would be there again after the restart, and after each."""
     wire = UdpWire()
     autopilot = HoveringAutopilot(wire)
     daemon = Daemon(config(f"folder:{folder}", f"udpout:127.0.0.1:{wire.port}"))
-    monkeypatch.setattr(daemon._reporter._herald, "tell", lambda *_: 1 // 0)
+    monkeypatch.setattr(daemon._reporter, part, None)
     try:
         with running(daemon):
             wait_for(lambda: daemon.statistics().get("report_errors", 0) >= 2, "two reports")
             wait_for(lambda: autopilot.messages("ODOMETRY"), "an estimate")
     finally:
         autopilot.close()
-    assert caplog.text.count("ZeroDivisionError") == 1
+    assert caplog.text.count("AttributeError") == 1
+
+
+class _Defective:
+    """In place of whoever is told."""
+
+    dropped = refused = 0
+    accepts_commands = False
+
+    def __getattr__(self, name: str) -> Any:
+        raise ZeroDivisionError(f"{name} has a defect")
+
+
+@pytest.mark.parametrize("whom", ["log", "bus", "page", "listener"])
+def test_a_defect_of_one_who_is_told_keeps_no_other_from_it(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: Any, whom: str
+) -> None:
+    told: Counter[str] = Counter()
+    daemon = Daemon(
+        config(
+            f"folder:{folder}", "udpout:127.0.0.1:9", log=LogOptions(folder=str(tmp_path)),
+            page=PageOptions(enabled=True, listen="127.0.0.1:0"),
+        ),
+        on_outcome=lambda *_: _Defective().told if whom == "listener" else told.update(["listener"]),
+    )  # fmt: skip
+    reporter = daemon._reporter
+
+    class Hearing:
+        dropped = refused = 0
+        accepts_commands = False
+
+        def __init__(self, name: str) -> None:
+            self._name = name
+
+        def __getattr__(self, name: str) -> Any:
+            return lambda *_: told.update([f"{self._name}.{name}"])
+
+    try:
+        with monkeypatch.context() as patch:
+            for name in ("log", "bus", "page"):
+                patch.setattr(reporter, f"_{name}", _Defective() if whom == name else Hearing(name))
+            for number in range(3):
+                reporter.publish(None, Rejected(number, Reason.BAD_FRAME, "cut short"))
+            reporter.step(time.monotonic_ns())
+    finally:
+        daemon.close()
+    expected = Counter(
+        {"listener": 3, "log.put": 3, "bus.publish": 3 + 3, "page.put": 3, "page.tell": 1, "log.note": 1}
+    )
+    assert told == Counter({name: n for name, n in expected.items() if name.split(".")[0] != whom})
+    statistics = daemon.statistics()
+    assert statistics["rejected"] == 3 and int(statistics["report_errors"]) >= 3
+    assert caplog.text.count("Traceback") == 1 and caplog.text.count("reporting to the") == 1
 
 
 @pytest.mark.parametrize(("changes", "words"), [({"crs": None}, "no reference system"), ({"offsets": None}, "geoid")])

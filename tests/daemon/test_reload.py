@@ -17,7 +17,9 @@ from adapters.hovering import TRUTH, HoveringAutopilot, config, wait_for
 from replay import rendered
 from test_daemon import toml
 
+from ortholoc_edge.adapters.computer import ComputerReader
 from ortholoc_edge.config import Config, read_config
+from ortholoc_edge.daemon import Daemon
 from ortholoc_edge.errors import ConfigError
 from ortholoc_edge.reload import RELOADABLE, plan_reload
 
@@ -61,6 +63,26 @@ def test_every_key_that_may_change_exists(key: str) -> None:
     table = msgspec.to_builtins(BASE)
     for part in key.split("."):
         table = table[part]
+
+
+class _NoFrames:
+    def read(self, timeout_s: float) -> None:
+        return None
+
+    def close(self) -> None:
+        pass
+
+
+def test_the_page_measures_by_the_budget_in_force() -> None:
+    daemon = Daemon(BASE, frames=_NoFrames())
+    try:
+        computer = ComputerReader().read()
+        assert daemon._reporter._page_health(0, computer).budget_ms == 200.0
+        daemon._take_over(plan_reload(BASE, changed(timing={"budget_ms": 80.0}, ladder={"rates_hz": ()})))
+        health = daemon._reporter._page_health(0, computer)
+        assert (health.budget_ms, health.rungs) == (80.0, 3)
+    finally:
+        daemon.close()
 
 
 # -- as a process --------------------------------------------------------------

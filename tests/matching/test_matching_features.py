@@ -15,7 +15,7 @@ from ortholoc_edge.matching.binary import BinaryMatcher, unavailable
 from ortholoc_edge.matching.lighterglue import LighterGlueMatcher
 from ortholoc_edge.matching.registry import BINARY, make_matcher
 from ortholoc_edge.matching.sift import SiftMatcher
-from ortholoc_edge.matching.types import Features, Matcher
+from ortholoc_edge.matching.types import Features, Matcher, ReducibleMatcher
 from ortholoc_edge.matching.xfeat import XFeatMatcher
 from ortholoc_edge.matching.xfeat_star import XFeatStarMatcher
 
@@ -114,6 +114,25 @@ def test_pixels_of_the_original_come_back_exactly(matcher: Matcher, width: int, 
     np.testing.assert_allclose(
         resize_px(whole.keypoints_px, (size[0] / width, size[1] / height)), small.keypoints_px, atol=1e-6
     )
+
+
+def test_reduced_it_works_on_less_and_the_matcher_itself_as_before(matcher: Matcher) -> None:
+    """A rung of the ladder: half the size, a quarter of the keypoints at most, in the original's pixels."""
+    assert isinstance(matcher, ReducibleMatcher)
+    scene = field(1024, 768)
+    whole = matcher.extract(scene)
+    half = matcher.reduced(0.5)
+    assert (matcher.working_px, half.working_px) == (640, 320)
+    few = half.extract(scene)
+    assert 100 < len(few) <= len(whole) / 2
+    assert np.ptp(few.keypoints_px, axis=0).min() > 500, "over the whole picture"
+    np.testing.assert_array_equal(matcher.extract(scene).keypoints_px, whole.keypoints_px)
+    shift = np.array([[1, 0, 32], [0, 1, -16], [0, 0, 1.0]])
+    errors = _errors(half, scene[64:704, 64:960], scene[80:720, 32:928], shift)
+    # Of its own pixels they are 2.8.
+    assert len(errors) > 40 and np.abs(np.median(errors, axis=0)).max() < 1.0
+    # It ends where nothing is left to see.
+    assert half.reduced(0.1).working_px == 128
 
 
 def test_change_of_resolution_without_bias(matcher: Matcher) -> None:

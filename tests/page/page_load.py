@@ -91,7 +91,7 @@ def memory() -> None:
     from ortholoc_edge.adapters.page.options import Listen
     from ortholoc_edge.clock import SystemClock
 
-    about = {"matcher": "structural", "budget_ms": 200.0, "vehicle": "load"}
+    about = {"matcher": "structural", "vehicle": "load"}
     camera = Camera.from_focal(1280, 960, 900.0)
     clock = SystemClock()
     page = GroundPage(Listen("127.0.0.1", 0, False, None, frozenset()), clock, store, camera, None, about)
@@ -158,7 +158,7 @@ def latency(args: argparse.Namespace) -> None:
     from ortholoc_edge.clock import SystemClock
 
     clock = SystemClock()
-    about = {"matcher": "structural", "budget_ms": 200.0, "vehicle": "load"}
+    about = {"matcher": "structural", "vehicle": "load"}
     page = GroundPage(Listen("127.0.0.1", 0, False, None, frozenset()), clock, store, rendered.CAMERA, None, about)
     while page.address is None:
         time.sleep(0.01)
@@ -201,7 +201,8 @@ def latency(args: argparse.Namespace) -> None:
                         page.tell(
                             Health(
                                 now_ns=stamp_ns, tracker="track", paused=False, autopilot=record, vehicle="x",
-                                trouble=None, computer=computer, rung=0, rungs=3, statistics={"sent": 1},
+                                trouble=None, computer=computer, budget_ms=200.0, rung=0, rungs=5, rate_hz=None,
+                                rung_why="", statistics={"sent": 1},
                             )
                         )  # fmt: skip
                 wall[mode].append(1e3 * (time.perf_counter() - began))

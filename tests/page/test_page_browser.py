@@ -37,7 +37,7 @@ class Feeder:
     def __init__(self, store: MapStore, listen: Listen) -> None:
         self.clock = SystemClock()
         self.page = GroundPage(
-            listen, self.clock, store, CAMERA, NADIR, {"matcher": "structural", "budget_ms": 200.0, "vehicle": "hawk"}
+            listen, self.clock, store, CAMERA, NADIR, {"matcher": "structural", "vehicle": "hawk"}
         )
         west, south, east, north = store.bounds
         self.middle = np.array([(west + east) / 2, (south + north) / 2, 400.0])
@@ -89,7 +89,8 @@ class Feeder:
         self.page.tell(
             Health(
                 now_ns=now_ns, tracker="track", paused=paused, autopilot=record, vehicle="ardupilot 4.6.1",
-                trouble=trouble, computer=computer, rung=1, rungs=3, statistics=statistics,
+                trouble=trouble, computer=computer, budget_ms=200.0, rung=1, rungs=5, rate_hz=None,
+                rung_why="processor hot, 72 C", statistics=statistics,
             )
         )  # fmt: skip
 
@@ -157,7 +158,7 @@ def test_a_flight_on_a_phone(browser: Chromium, flying: Feeder) -> None:
     assert "σ 5.61 m" in tab.text("#state"), "the long axis of the ellipse: the root of 17 + sqrt(8² + 12²)"
     assert tab.run("document.documentElement.scrollWidth") <= 360, "nothing sticks out"
     badges = tab.text("#badges")
-    assert "link up" in badges and "fixes fused" in badges and "throttled" in badges and "rung 1 of 2" in badges
+    assert "link up" in badges and "fixes fused" in badges and "throttled" in badges and "rung 1 of 4" in badges
     figures = tab.text("#figures")
     for words in ("100\n\nof 200 matches", "72 °C", "exposure to sent 80 ms, p99 120 ms", "0.50 m from the last fix"):
         assert words in figures, words

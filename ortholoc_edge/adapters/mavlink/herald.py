@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from ortholoc_edge.adapters.mavlink.monitor import Fusion, FusionReport
 from ortholoc_edge.adapters.mavlink.options import Severity
+from ortholoc_edge.pipeline.ladder import Cause, Step
 from ortholoc_edge.pipeline.witness import Consistency, WitnessReport
 
 
@@ -14,10 +15,25 @@ class Herald:
         self._fusion = Fusion.UNKNOWN
         self._consistency = Consistency.UNKNOWN
         self._height_told = False
+        self._less_told = False
 
     def tell(self, fusion: FusionReport, witness: WitnessReport) -> list[tuple[Severity, str]]:
         """Lines for STATUSTEXT; each of them is of a change."""
         return [*self._tell_fusion(fusion), *self._tell_gnss(witness)]
+
+    def tell_step(self, step: Step) -> list[tuple[Severity, str]]:
+        """Of the ladder: what heat takes, that frames are left out, and when all is well again. What time alone takes
+        comes and goes, and the ground page shows it."""
+        if step.rung > step.was:
+            if step.cause is not Cause.HEAT and step.rate_hz is None:
+                return []
+            self._less_told = True
+            less = "less detail" if step.rate_hz is None else f"{step.rate_hz:g} Hz at most"
+            return [(Severity.WARNING, f"OrthoLoC: {less}: {step.why}")]
+        if step.rung > 0 or not self._less_told:
+            return []
+        self._less_told = False
+        return [(Severity.INFO, "OrthoLoC: full detail and rate again")]
 
     def _tell_fusion(self, report: FusionReport) -> list[tuple[Severity, str]]:
         if report.state is self._fusion:

@@ -67,7 +67,8 @@ class Health(Struct, frozen=True, kw_only=True):
 
     Attributes:
         now_ns: of the daemon's clock. tracker: of `TrackerStatus`. paused: by a command. vehicle: who answers on the
-            link; trouble: why nobody does. rungs: how many rungs of detail there are.
+            link; trouble: why nobody does. budget_ms: wall time that a frame may take; None: any.
+        rung, rungs, rate_hz: of the ladder, see `LadderMessage`; rung_why: what led to the present one.
     """
 
     now_ns: int
@@ -77,8 +78,11 @@ class Health(Struct, frozen=True, kw_only=True):
     vehicle: str | None
     trouble: str | None
     computer: ComputerStatus
+    budget_ms: float | None
     rung: int
     rungs: int
+    rate_hz: float | None
+    rung_why: str
     statistics: Mapping[str, Any]
 
 
@@ -123,7 +127,7 @@ class GroundPage:
         Args:
             clock: the one of frames' stamps.
             camera, body_from_camera: as configured; None: in a gimbal.
-            about: more for the page's head: ``matcher``, ``budget_ms``.
+            about: more for the page's head: ``matcher``, ``vehicle``.
         """
         self._listen, self._clock = listen, clock
         west, south, east, north = store.bounds

@@ -168,7 +168,7 @@ function badges(state) {
   if (computer.is_under_voltage) list.push(["bad", "UNDER-VOLTAGE"]);
   if (computer.is_throttled) list.push(["warn", "throttled"]);
   if (computer.is_hot) list.push(["warn", "hot"]);
-  if (health.rung > 0) list.push(["warn", `less detail: rung ${health.rung} of ${health.rungs - 1}`]);
+  if (health.rung > 0) list.push(["warn", `less detail${health.rate_hz ? `, ${health.rate_hz} Hz` : ""}: rung ${health.rung} of ${health.rungs - 1}`]);
   if (health.statistics.map_files_damaged) list.push(["warn", `${health.statistics.map_files_damaged} map files damaged`]);
   return state.word === "NO CONTACT" ? list.map(([, text]) => ["calm", `${text} (old)`]) : list;
 }
@@ -285,7 +285,8 @@ function renderFigures(state) {
     add("Processor", busy.length ? `${Math.round(busy.reduce((a, b) => a + b, 0) / busy.length)} %` : "\u2013",
       `of ${busy.length} cores; memory ${computer.memory_used_mib} of ${computer.memory_total_mib} MiB`);
     add("Detail", health.rung === 0 ? "full" : `rung ${health.rung} of ${health.rungs - 1}`,
-      health.rung === 0 ? "" : "less, to keep pace", health.rung === 0 ? "" : "warn");
+      health.rung === 0 ? "" : [health.rate_hz && `${health.rate_hz} frames a second`, health.rung_why].filter(Boolean).join("; "),
+      health.rung === 0 ? "" : "warn");
     add("Tracker", health.tracker, `${statistics.fixes || 0} fixes, ${statistics.rejected || 0} frames without`);
   }
   if (fix && known.scene) {
@@ -313,7 +314,7 @@ function renderStages() {
     const values = taken.map((took) => took[name] || 0).sort((a, b) => a - b);
     return values[Math.floor(values.length / 2)];
   };
-  const total = median("total"), budget = known.scene.budget_ms || total;
+  const total = median("total"), budget = (known.health && known.health.budget_ms) || total;
   const top = Math.max(total, budget);
   const shown = names.filter((name) => median(name) >= 0.05).sort((a, b) => median(b) - median(a));
   for (const name of [...shown, ...(median("structural") ? sums : ["total"])]) {
