@@ -128,6 +128,7 @@ def _tables(options: FlightOptions, pictures: Path, link: str) -> dict[str, dict
         },
         # One resolution for both, whatever the computer does meanwhile.
         "timing": {"max_age_ms": 5000.0, "budget_ms": 5000.0},
+        "ladder": {"max_load_percent": 100.0},
     }  # fmt: skip
 
 
