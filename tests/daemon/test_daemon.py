@@ -226,7 +226,9 @@ def test_without_an_origin_nothing_is_sent(folder: Path) -> None:
         autopilot.close()
     assert autopilot.messages("ODOMETRY") == []
     assert autopilot.messages("VISION_POSITION_ESTIMATE") == []
-    assert {m.system_status for m in autopilot.messages("HEARTBEAT")} == {SystemStatus.STANDBY}, "nobody is served"
+    # The first may come before it is warm.
+    states = {m.system_status for m in autopilot.messages("HEARTBEAT")}
+    assert SystemStatus.STANDBY in states and states <= {SystemStatus.BOOT, SystemStatus.STANDBY}, "nobody is served"
     assert autopilot.got_counts["SET_GPS_GLOBAL_ORIGIN"] == 0
     assert len(texts) == 1 and "not sent" in texts[0]
 
