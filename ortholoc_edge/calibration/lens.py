@@ -27,10 +27,13 @@ MODELS: dict[str, tuple[str, ...]] = {
 }  # fmt: skip
 _TERMS = ("k1", "k2", "p1", "p2", "k3")
 _FOLDS = 5
+# Of the squared error on held-out views: less than this is no reason for another term.
+_NO_GAIN = 0.02
 # A view whose error is so many times the usual one, and this many px, shows something else: a bent board, a smear.
 _BAD_VIEW, _LEAST_BAD_PX = 2.5, 0.15
-# A corner that is so many robust sigmas off, and this many px, is no corner of the board.
-_BAD_CORNER, _LEAST_BAD_CORNER_PX = 6.0, 0.5
+# A corner that is so many times as far off as half of its view's are, is no corner of the board; nor are more than so
+# many of a view, which is a bad one then.
+_BAD_CORNER, _MOST_BAD_CORNERS = 4.0, 0.1
 _MOST_BAD_VIEWS = 1 / 3
 LEAST_VIEWS = 10
 # Tilt of the board that tells the focal length from the distance, and how many views must have it.
@@ -168,7 +171,7 @@ def _solved(views: Sequence[View], board: Board, size: tuple[int, int], model: s
             [points[view.seen.ids].astype(np.float32) for view in views],
             [view.seen.px.astype(np.float32) for view in views],
             size, np.eye(3), np.zeros(5), flags=flags,
-            criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12),
+            criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-10),
         )  # fmt: skip
     except cv2.error:
         # Of boards that are all parallel to the picture there is no start.
@@ -194,23 +197,21 @@ def _residuals(view: View, board: Board, solution: _Solution, number: int) -> Fl
 def _agreeing(views: list[View], board: Board, size: tuple[int, int]) -> tuple[list[View], dict[str, str]]:
     """The views, and corners in them, that agree with each other; and why the others don't."""
     removed: dict[str, str] = {}
+    least = {view.name: (1.0 - _MOST_BAD_CORNERS) * len(view.seen.ids) for view in views}
     while True:
         solution = _solved(views, board, size, "k1k2p1p2")
         if solution is None:
             return views, removed
         errors = [_residuals(view, board, solution, number) for number, view in enumerate(views)]
-        sigma = 1.4826 * float(np.median(np.abs(np.concatenate(errors))))
-        limit = max(_BAD_CORNER * sigma, _LEAST_BAD_CORNER_PX)
         rms = np.array([np.sqrt(np.mean(np.sum(error**2, axis=1))) for error in errors])
         usual = float(np.median(rms))
         worst = int(rms.argmax())
         if rms[worst] > max(_BAD_VIEW * usual, _LEAST_BAD_PX):
-            good = np.linalg.norm(errors[worst], axis=1) <= limit
-            view = views[worst]
-            # Some wrong corners don't spoil a view; a wrong view has no good ones to speak of.
-            if good.mean() > 0.9 and not good.all():
-                seen = view.seen
-                views[worst] = View(view.name, Seen(seen.ids[good], seen.px[good], seen.blur_px))
+            view, off = views[worst], np.linalg.norm(errors[worst], axis=1)
+            seen, corner = view.seen, int(off.argmax())
+            if off[corner] > _BAD_CORNER * float(np.median(off)) and len(off) - 1 >= least[view.name]:
+                left = np.arange(len(off)) != corner
+                views[worst] = View(view.name, Seen(seen.ids[left], seen.px[left], seen.blur_px))
                 continue
             removed[view.name] = f"{rms[worst]:.2f} px rms where {usual:.2f} px is usual"
             del views[worst]
@@ -237,13 +238,14 @@ def _held_out(views: Sequence[View], board: Board, size: tuple[int, int], model:
 
 
 def _simplest(held_out: Mapping[str, FloatArray]) -> str:
-    """The first whose error on held-out views is within one standard error of the best one's."""
+    """The first whose error on held-out views is within one standard error of the best one's, or nearly as small."""
     best = min(held_out, key=lambda name: float(held_out[name].mean()))
     for name, errors in held_out.items():
         if not np.isfinite(errors).all():
             continue
         more = errors - held_out[best]
-        if name == best or float(more.mean()) <= float(more.std(ddof=1)) / math.sqrt(len(more)):
+        chance = float(more.std(ddof=1)) / math.sqrt(len(more))
+        if name == best or float(more.mean()) <= max(chance, _NO_GAIN * float(held_out[best].mean())):
             return name
     return best
 

@@ -111,7 +111,7 @@ def look_for(frames: Iterable[Frame], board: Board, most: int) -> Looked:
         raise CameraError(f"{board} was found in none of {looked_at} pictures; {_advice(board, without)}")
     unlike = _unlike(found, size)
     left_out["like others"] = len(found) - len(unlike)
-    kept = _farthest(unlike, size, most)
+    kept = farthest(unlike, size, most)
     left_out["more than needed"] = len(unlike) - len(kept)
     return Looked(size, looked_at, tuple(kept), +left_out)
 
@@ -153,7 +153,7 @@ def _apart_px(one: View, other: View) -> float:
     return float(np.linalg.norm(one.seen.px[here] - other.seen.px[there], axis=1).mean())
 
 
-def _farthest(views: list[View], size: tuple[int, int], most: int) -> list[View]:
+def farthest(views: list[View], size: tuple[int, int], most: int) -> list[View]:
     """So many that are as unlike each other as can be."""
     if len(views) <= most:
         return views
