@@ -14,8 +14,9 @@ for a hundred independent witnesses. What the flight does not tell keeps the sig
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -49,13 +50,13 @@ _ATTITUDE_WHITE, _GNSS_WHITE = math.radians(0.05), 0.05
 # Of six squared standard deviations, 0.999; what is beyond counts for less.
 _MOST_NIS = {3: 16.3, 6: 22.5}
 # Frames beyond these tell little more, and cost time.
-_MOST_FRAMES = 400
-_ROUNDS = 4
+_MOST_FRAMES = 300
+# Of the noise, in natural logarithms: coarse, then fine, so many times around each.
+_STEPS, _ROUNDS = (0.8, 0.3), 2
 # Of the solution; the noise is looked for in the first two.
 _MOST_STEPS, _NOISE_STEPS = 6, 2
 _SMALL_TURN, _SMALL_TIME_S = math.radians(0.005), 1e-4
 _MOST_LATE_S = 0.5
-_STEPS = (0.7, 0.35, 0.15)
 # Of the picture that stands for one; steps to where its rays meet the surface; and the part of a ray that must point
 # down.
 _GRID = (9, 7)
@@ -121,8 +122,9 @@ class Noise:
 
 
 _EXPECTED = Noise()
-# How far from these it may well be, in natural logarithms.
-_DOUBT = {name: 0.7 if name.endswith("_s") else 1.0 for name in Noise.__slots__} | {"fixes": 2.0, "fixes_slow": 2.0}
+# How far from these it may well be, in natural logarithms. Of an error that changes its sign five times in a flight the
+# flight tells little: with twice the doubt a heading came out 3.7 of its sigmas off.
+_DOUBT = {name: 0.5 for name in Noise.__slots__} | {"fixes": 2.0, "fixes_slow": 2.0}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -212,7 +214,7 @@ def solve(flights: Sequence[Sequence[Sighting]], body_from_camera: Rigid3) -> Fl
     for number in range(_MOST_STEPS):
         rows = [[_Row.of(one, mount, late_s) for one in flight] for flight in thinned]
         if number < _NOISE_STEPS:
-            noise = _most_probable(rows, noise)
+            noise = _most_probable(rows, noise, _STEPS[number:])
         found = _filtered(rows, noise)
         turned, later_s = found.mean[_MOUNT], float(found.mean[_LATE])
         mount = Rigid3(rotation.exp(turned) @ mount.rotation, mount.translation)
@@ -303,6 +305,8 @@ def _filtered(flights: Sequence[Sequence[_Row]], noise: Noise) -> _Filtered:
     covariance = np.zeros((_STATES, _STATES))
     covariance[:_CONSTANTS, :_CONSTANTS] = np.diag(np.square(list(_PRIOR.values())))
     white = np.diag(np.square([_GNSS_WHITE] * 3 + [_ATTITUDE_WHITE] * 3))
+    kept = np.ones(_STATES)
+    growing = np.arange(_CONSTANTS, _STATES)
     score, outlying = 0.0, 0
     for flight in flights:
         # Another flight: the slow errors have nothing to do with those of the last.
@@ -312,52 +316,47 @@ def _filtered(flights: Sequence[Sequence[_Row]], noise: Noise) -> _Filtered:
         last_ns: int | None = None
         for row in flight:
             if last_ns is not None:
-                kept = np.ones(_STATES)
                 kept[slow] = np.exp(-max(row.stamp_ns - last_ns, 0) * 1e-9 / times_s)
                 mean = mean * kept
-                covariance = covariance * np.outer(kept, kept)
-                covariance[slow, slow] += np.diag(sigma**2 * (1.0 - kept[slow] ** 2))
+                covariance = covariance * (kept[:, None] * kept)
+                covariance[growing, growing] += sigma**2 * (1.0 - kept[slow] ** 2)
             last_ns = row.stamp_ns
             count = len(row.measured)
             own = noise.fixes * row.covariance + white[-count:, -count:]
             off = row.measured - row.by_state @ mean
             across = covariance @ row.by_state.T
             spread = row.by_state @ across + own
-            weighed = np.linalg.solve(spread, np.column_stack([off, across.T]))
-            nis = float(off @ weighed[:, 0])
+            inverse = np.linalg.inv(spread)
+            nis = float(off @ inverse @ off)
             if nis > _MOST_NIS[count]:
                 outlying += 1
                 spread = spread + own * (nis / _MOST_NIS[count] - 1.0)
-                weighed = np.linalg.solve(spread, np.column_stack([off, across.T]))
-                nis = float(off @ weighed[:, 0])
-            mean = mean + across @ weighed[:, 0]
-            covariance = covariance - across @ weighed[:, 1:]
+                inverse = np.linalg.inv(spread)
+                nis = float(off @ inverse @ off)
+            gain = across @ inverse
+            mean = mean + gain @ off
+            covariance = covariance - gain @ across.T
             covariance = 0.5 * (covariance + covariance.T)
-            score -= 0.5 * (nis + float(np.linalg.slogdet(spread)[1]))
+            score -= 0.5 * (nis + math.log(np.linalg.det(spread)))
     return _Filtered(mean, covariance, score, outlying)
 
 
-def _most_probable(flights: Sequence[Sequence[_Row]], start: Noise) -> Noise:
+def _most_probable(flights: Sequence[Sequence[_Row]], start: Noise, steps: Sequence[float]) -> Noise:
     """The noise of which the measurements, and what is known of it, are most probable: one figure after another, in
     steps that get smaller."""
     best, best_score = start, _filtered(flights, start).score + _expected_score(start)
-    for step in _STEPS:
-        for _ in range(_ROUNDS):
-            before = best_score
-            for other in _neighbours(best, step, len(Noise.__slots__)):
-                candidate = replace(best, **other)
+    for step, _ in product(steps, range(_ROUNDS)):
+        before = best_score
+        for name in Noise.__slots__:
+            for sign in (1.0, -1.0):
+                candidate = replace(best, **{name: getattr(best, name) * math.exp(sign * step)})
                 score = _filtered(flights, candidate).score + _expected_score(candidate)
                 if score > best_score:
                     best, best_score = candidate, score
-            if best_score - before < 0.5:
-                break
+                    break
+        if best_score - before < 0.5:
+            break
     return best
-
-
-def _neighbours(noise: Noise, step: float, count: int) -> Iterator[dict[str, float]]:
-    for name in Noise.__slots__[:count]:
-        for sign in (1.0, -1.0):
-            yield {name: getattr(noise, name) * math.exp(sign * step)}
 
 
 def _expected_score(noise: Noise) -> float:
