@@ -91,9 +91,9 @@ def corners(seed: int, count: int = 18, noise_px: float = 0.1, **others) -> list
 
 
 def test_sigmas_are_honest():
-    """The normalised error squared, over what was solved for, of eight sets of corners: 1, give or take 0.18."""
+    """The normalised error squared, over what was solved for, of five sets of corners: 1, give or take 0.22."""
     nees = []
-    for seed in range(8):
+    for seed in range(5):
         found = calibrate(corners(seed), CHESSBOARD, SIZE, "k1k2p1p2")
         assert isinstance(found, LensCalibration), found
         off = errors(found)

@@ -518,12 +518,12 @@ class Telemetry:
         """See :meth:`AutopilotLink.turns_before`."""
         best = self._timesync.best(stamp_ns) if self._timesync.synchronised else None
         time_ns = stamp_ns + best[0] if best is not None else stamp_ns
-        now, _ = self._attitude_at(time_ns, best is not None)
+        now, *_ = self._attitude_at(time_ns, best is not None)
         if now is None:
             return None
         turns = np.empty((len(ages_ns), 3))
         for row, age_ns in zip(turns, ages_ns, strict=True):
-            then, _ = self._attitude_at(time_ns - age_ns, best is not None)
+            then, *_ = self._attitude_at(time_ns - age_ns, best is not None)
             if then is None:
                 return None
             row[:] = rotation.log(now.T @ then)
