@@ -518,6 +518,9 @@ class Telemetry:
         """See :meth:`AutopilotLink.turns_before`."""
         best = self._timesync.best(stamp_ns) if self._timesync.synchronised else None
         time_ns = stamp_ns + best[0] if best is not None else stamp_ns
+        unconfirmed_ns = self._unconfirmed_after_ns
+        if best is not None and unconfirmed_ns is not None and time_ns > unconfirmed_ns:
+            return None
         now, *_ = self._attitude_at(time_ns, best is not None)
         if now is None:
             return None
