@@ -23,6 +23,7 @@ from ortholoc_edge.geometry.arrays import FloatArray
 # What is told better than this is a calibration, and what is not is none: a degree of mount is 1.7 m per 100 m of
 # height, 10 ms are 0.2 m at 20 m/s, a percent of focal length is a metre of height per 100 m. Of the focal length a
 # flight is a check: a board tells it far better.
+_SURE_SIGMAS = 2.0
 _MOST_MOUNT_DEG, _MOST_YAW_DEG, _MOST_LATE_MS, _MOST_FOCAL = 0.3, 0.5, 10.0, 0.02
 
 
@@ -164,8 +165,12 @@ def _line(one: Told) -> str:
 
 
 def _paste(flown: Flown, told: list[Told]) -> str:
-    """The tables with what was told; the rest as it was."""
+    """The tables with what was told; the rest as it was. Of the focal length only what is surely wrong: a board knows
+    it better."""
     by_name = {one.name: one.now if one.told else one.was for one in told}
+    focal = next(one for one in told if one.name == "intrinsics.focal")
+    if abs(focal.now - focal.was) <= _SURE_SIGMAS * focal.sigma:
+        by_name[focal.name] = focal.was
     mount = flown.config.mount
     lines = [
         "[mount]", f'preset = "{mount.preset}"',
