@@ -23,6 +23,7 @@ from ortholoc_edge.adapters.mavlink import GimbalSelection, LinkOptions
 from ortholoc_edge.adapters.page.options import PageOptions
 from ortholoc_edge.adapters.page.options import refused as page_refused
 from ortholoc_edge.adapters.secret import LEFT_OUT, without_credentials
+from ortholoc_edge.calibration.files import read_camera
 from ortholoc_edge.errors import ConfigError
 from ortholoc_edge.geometry import frames, rotation
 from ortholoc_edge.geometry.arrays import FloatArray
@@ -42,8 +43,15 @@ _XFEAT_MULTIPLE_PX = 32
 
 
 class Intrinsics(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A pinhole camera with OpenCV's distortion (k1, k2, p1, p2, k3); pixel centres at integers."""
+    """A pinhole camera with OpenCV's distortion (k1, k2, p1, p2, k3); pixel centres at integers.
 
+    Attributes:
+        file, file_camera: where the others were read from, and which of its cameras, if they were (`read_config`). A
+            configuration that is kept, in a flight log, say, has what the file said then, and needs it no more.
+    """
+
+    file: Annotated[str, Meta(min_length=1)] | None = None
+    file_camera: Annotated[str, Meta(min_length=1)] | None = None
     width_px: Annotated[int, Meta(ge=16)]
     height_px: Annotated[int, Meta(ge=16)]
     fx: Annotated[float, Meta(gt=0)]
@@ -58,6 +66,10 @@ class Intrinsics(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def camera(self) -> Camera:
         return Camera(self.width_px, self.height_px, self.fx, self.fy, self.cx, self.cy, self.distortion)
+
+
+# What may stand beside ``file``: which of its cameras, and the size where the file does not say it.
+_BESIDE_FILE = frozenset({"file", "file_camera", "width_px", "height_px"})
 
 
 class MountOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -225,6 +237,7 @@ def read_config(path: Path) -> Config:
         raw = tomllib.loads(text)
         # Before the tables are made: they would name only themselves, not the key.
         _raise_first(path, _not_finite(raw, "$"))
+        _read_intrinsics_file(path, raw)
         config = msgspec.convert(raw, Config)
     except tomllib.TOMLDecodeError as err:
         raise ConfigError(f"{path}: not TOML: {err}") from err
@@ -232,6 +245,45 @@ def read_config(path: Path) -> Config:
         raise ConfigError(f"{path}: {err}; {_allowed(str(err))}") from err
     _raise_first(path, _contradictions(config))
     return config
+
+
+def _read_intrinsics_file(path: Path, raw: dict[str, Any]) -> None:
+    """Put what the file of ``[intrinsics] file`` says into the table, in the place of its name."""
+    table = raw.get("intrinsics")
+    if not isinstance(table, dict) or "file" not in table:
+        if isinstance(table, dict) and "file_camera" in table:
+            raise ConfigError(f"{path}: `$.intrinsics.file_camera` without `$.intrinsics.file`, whose camera it names")
+        return
+    both = sorted(set(table) - _BESIDE_FILE)
+    if both:
+        raise ConfigError(
+            f"{path}: `$.intrinsics.file` and `$.intrinsics.{both[0]}`: the file says what the camera is; leave one of "
+            "them out"
+        )
+    beside = msgspec.convert({"intrinsics": table}, _Beside).intrinsics
+    try:
+        camera = read_camera(path.parent / beside.file, beside.file_camera, (beside.width_px, beside.height_px))
+    except ConfigError as err:
+        raise ConfigError(f"{path}: `$.intrinsics.file`: {err}") from err
+    table |= {
+        "width_px": camera.width, "height_px": camera.height, "fx": camera.fx, "fy": camera.fy, "cx": camera.cx,
+        "cy": camera.cy, "distortion": list(camera.distortion),
+    }  # fmt: skip
+
+
+class _BesideFile(Struct, frozen=True, kw_only=True):
+    """``[intrinsics]`` with a file, before it is read."""
+
+    file: Annotated[str, Meta(min_length=1)]
+    file_camera: Annotated[str, Meta(min_length=1)] | None = None
+    width_px: Annotated[int, Meta(ge=16)] | None = None
+    height_px: Annotated[int, Meta(ge=16)] | None = None
+
+
+class _Beside(Struct, frozen=True, kw_only=True):
+    """For the key's whole name in msgspec's refusals."""
+
+    intrinsics: _BesideFile
 
 
 def config_text(config: Config) -> str:

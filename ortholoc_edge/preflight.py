@@ -77,6 +77,7 @@ def check_computer(config: Config, clock: Clock, environ: Mapping[str, str]) -> 
     return [
         *check_clock(wall_clock_ns(), is_synchronised()),
         *devices,
+        *check_intrinsics(config),
         *check_keys(config, environ),
         *check_pack(config, status),
         *check_model(config),
@@ -196,6 +197,32 @@ def check_keys(config: Config, environ: Mapping[str, str]) -> list[Finding]:
                 _error(subject, error, "one that nobody else can read", "without it the daemon does not start")
             )
     return findings
+
+
+# -- intrinsics ----------------------------------------------------------------------------------------
+
+
+def check_intrinsics(config: Config) -> list[Finding]:
+    """The lens has a ray for each pixel: a polynomial fitted to the middle of the picture folds back before its rim."""
+    camera = config.intrinsics.camera()
+    right, below = camera.width - 1.0, camera.height - 1.0
+    along = np.linspace(0.0, 1.0, 33)
+    rim = np.concatenate(
+        [
+            np.column_stack([along * right, np.zeros(33)]), np.column_stack([along * right, np.full(33, below)]),
+            np.column_stack([np.zeros(33), along * below]), np.column_stack([np.full(33, right), along * below]),
+        ]
+    )  # fmt: skip
+    blind = 1.0 - float(np.isfinite(camera.unproject(rim)).all(axis=1).mean())
+    if blind == 0.0:
+        return []
+    return [
+        Finding(
+            Level.WARNING, "intrinsics", f"no ray for {blind:.0%} of the picture's rim", "one for each pixel",
+            "the distortion folds back before it, so what is seen there is lost, and near it wrong",
+            "calibrate with the board in the picture's corners, and fewer terms: ortholoc-edge calibrate",
+        )
+    ]  # fmt: skip
 
 
 # -- map and model -------------------------------------------------------------------------------------

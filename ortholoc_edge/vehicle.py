@@ -27,7 +27,7 @@ from ortholoc_edge.geometry import covariance as cov
 from ortholoc_edge.geometry import frames
 from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.rigid import Rigid3
-from ortholoc_edge.pipeline.frame import CameraMount, VehicleState
+from ortholoc_edge.pipeline.frame import TURN_AGES_NS, CameraMount, VehicleState
 from ortholoc_edge.pipeline.outcome import Fix
 from ortholoc_edge.pipeline.tracker import Tracker
 from ortholoc_edge.tiles.georeference import Georeference
@@ -100,6 +100,7 @@ class Vehicle:
             self._believed_position(known),
             known.velocity_ned,
             known.turning_rad_s,
+            self._link.turns_before(stamp_ns, TURN_AGES_NS),
         )
 
     def _believed_position(self, known: AutopilotState) -> FloatArray | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -48,6 +49,13 @@ def run(args: argparse.Namespace) -> int:
     else:
         given = sum(1 for _ in _leaves(msgspec.to_builtins(config)))
         print(f"{args.file}: can be flown with; {given} values in force, see them with --json")
+        if config.intrinsics.file is not None:
+            camera = config.intrinsics.camera()
+            wide_deg = math.degrees(2.0 * math.atan(0.5 * camera.width / camera.fx))
+            print(
+                f"intrinsics of {config.intrinsics.file}: {camera.width} x {camera.height} px, focal length "
+                f"{camera.focal_px:.1f} px ({wide_deg:.0f} degrees wide), distortion {list(camera.distortion)}"
+            )
     return 0
 
 

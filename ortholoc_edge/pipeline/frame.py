@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
 from ortholoc_edge.geometry.rigid import Rigid3
 
+# Of `VehicleState.turns_before`: as far back as stamps of cameras are late, and as finely as attitudes come.
+TURN_AGES_NS = tuple(20_000_000 * step for step in range(1, 13))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
@@ -58,6 +61,9 @@ class VehicleState:
         velocity_ned_m_s: (3,), true north; None where that is not known.
         turning_rad_s: (3,) angular velocity of the body about its own axes; None where that is not known.
         no_attitude_because: in words, where that is known; empty otherwise.
+        turns_before: (K, 3) how the body was turned `TURN_AGES_NS` before the stamp, against ``ned_from_body``:
+            rotation vectors about its axes at the stamp, rad. None where that is not known. `calibrate-flight` tells a
+            late stamp by it.
         mount: of a camera in a gimbal, as it was at the stamp; None of a fixed one, which the tracker knows, and
             where nothing is known of the gimbal.
     """
@@ -74,3 +80,4 @@ class VehicleState:
     believed_map_m: FloatArray | None = None
     velocity_ned_m_s: FloatArray | None = None
     turning_rad_s: FloatArray | None = None
+    turns_before: FloatArray | None = None

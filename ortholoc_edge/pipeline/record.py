@@ -96,7 +96,7 @@ class FrameRecord(Struct, frozen=True, kw_only=True):
         mount: the gimbal's ``body_from_camera`` as (3, 4) and its sigmas; None of a fixed one.
         outcome: `outcome_record`, before its age was looked at.
         orders, tuning: `Circumstances.orders` and ``tuning``; logs of older versions have none, nor have they
-            velocity, turning, exposure and repeats.
+            velocity, turning, exposure, repeats and ``turns_before``.
     """
 
     number: int
@@ -124,6 +124,7 @@ class FrameRecord(Struct, frozen=True, kw_only=True):
     turning_rad_s: list[float | None] | None = None
     exposure_ns: int | None = None
     repeats: int = 0
+    turns_before: list[list[float]] | None = None
 
     def state(self) -> VehicleState:
         return VehicleState(
@@ -139,6 +140,7 @@ class FrameRecord(Struct, frozen=True, kw_only=True):
             None if self.believed_map_m is None else _floats(self.believed_map_m),
             None if self.velocity_ned_m_s is None else _floats(self.velocity_ned_m_s),
             None if self.turning_rad_s is None else _floats(self.turning_rad_s),
+            None if self.turns_before is None else _floats(self.turns_before),
         )
 
     def circumstances(self) -> Circumstances:
@@ -186,6 +188,7 @@ def frame_record(
         turning_rad_s=None if state.turning_rad_s is None else state.turning_rad_s.tolist(),
         exposure_ns=exposure_ns,
         repeats=circumstances.repeats,
+        turns_before=None if state.turns_before is None else state.turns_before.tolist(),
     )
 
 

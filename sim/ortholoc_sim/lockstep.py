@@ -174,7 +174,8 @@ class _Camera:
         truth = self._flight.true_pose(stamp_ns)
         image = self._image(stamp_ns, number)
         image.flags.writeable = False
-        frame = Frame(stamp_ns, image, f"{number:05d}", round(self._table.exposure_ms * _MS))
+        late_ns = round(self._flight.scenario.miscalibration.stamp_late_ms * _MS)
+        frame = Frame(stamp_ns + late_ns, image, f"{number:05d}", round(self._table.exposure_ms * _MS))
         there_ns = stamp_ns + round(self._table.delay_ms * _MS)
         late = self._flight.fault("frames_late", stamp_ns)
         if late is not None and late.amount is not None:
@@ -301,6 +302,7 @@ class _Worker:
 class _Flight:
     def __init__(self, scenario: Scenario, seed: int, folder: Path, log: Path | None) -> None:
         self.scenario, self.seed = scenario, seed
+        self._mount = scenario.miscalibration.true_mount(scenario.mount)
         self._log = LogOptions(folder=None if log is None else str(log), max_mb=_LOG_MB, frames="all")
         self._pack = pack_for(scenario, folder)
         self._grounds = make_grounds(scenario.world, scenario.map.kind)
@@ -328,7 +330,7 @@ class _Flight:
 
     def true_pose(self, stamp_ns: int) -> Rigid3:
         """``map_from_camera`` at a time that was flown."""
-        pose = true_camera_pose(self._loop, self._site, self.scenario.mount, stamp_ns)
+        pose = true_camera_pose(self._loop, self._site, self._mount, stamp_ns)
         assert pose is not None, "frames are drawn when their time has passed"
         return pose
 
@@ -470,7 +472,7 @@ class _Flight:
         scenario = self.scenario
         return Config(
             camera=CameraOptions(source="device:unused"),
-            intrinsics=scenario.camera.intrinsics(),
+            intrinsics=scenario.miscalibration.told(scenario.camera.intrinsics()),
             map=MapOptions(pack=str(self._pack)),
             link=scenario.link,
             mount=scenario.mount,

@@ -135,6 +135,32 @@ class CameraTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         )  # fmt: skip
 
 
+class MiscalibrationTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """``[miscalibration]``: by how much the camera is other than the daemon is told, for `calibrate-flight` to find.
+
+    Attributes:
+        mount_deg: roll, pitch, yaw: what is missing in those of ``[mount]``.
+        stamp_late_ms: frames are stamped so long after mid-exposure: what is missing in the daemon's ``latency_ms``.
+        focal: the focal length is longer by this part than the daemon's.
+    """
+
+    mount_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    stamp_late_ms: Annotated[float, Meta(ge=-500, le=500)] = 0.0
+    focal: Annotated[float, Meta(gt=-0.5, lt=1.0)] = 0.0
+
+    def told(self, intrinsics: Intrinsics) -> Intrinsics:
+        """What the daemon is told of the intrinsics as they are."""
+        longer = 1.0 + self.focal
+        return msgspec.structs.replace(intrinsics, fx=intrinsics.fx / longer, fy=intrinsics.fy / longer)
+
+    def true_mount(self, told: MountOptions) -> MountOptions:
+        """How the camera sits, of what the daemon is told."""
+        roll, pitch, yaw = self.mount_deg
+        return msgspec.structs.replace(
+            told, roll_deg=told.roll_deg + roll, pitch_deg=told.pitch_deg + pitch, yaw_deg=told.yaw_deg + yaw
+        )
+
+
 class GimbalTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """``[gimbal]``: see `autopilot.GimbalOptions`; goes with ``[mount] gimbal``."""
 
@@ -287,6 +313,7 @@ class Scenario(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     wind: WindTable = field(default_factory=WindTable)
     camera: CameraTable = field(default_factory=CameraTable)
     mount: MountOptions = field(default_factory=MountOptions)
+    miscalibration: MiscalibrationTable = field(default_factory=MiscalibrationTable)
     gimbal: GimbalTable | None = None
     autopilot: AutopilotTable = field(default_factory=AutopilotTable)
     line: LineOptions = field(default_factory=LineOptions)

@@ -571,6 +571,14 @@ def turning(rate: float):
     return script, move, wrong_rad
 
 
+def test_turns_before_a_stamp_are_those_that_were_flown():
+    script, move, _ = turning(0.4)
+    script.run(5.0, move=move)
+    before = script.protocol.telemetry.turns_before(script.now - 60 * MS, (20 * MS, 100 * MS, 240 * MS))
+    assert before == pytest.approx(-0.4 * np.outer([0.02, 0.1, 0.24], [0.0, 0.0, 1.0]), abs=1e-3)
+    assert script.protocol.telemetry.turns_before(script.now - 60 * MS, (20 * MS, 60 * S)) is None
+
+
 def test_one_stamp_of_the_future_keeps_none_of_the_present_out():
     script, move, wrong_rad = turning(0.4)
     script.run(5.0, move=move)

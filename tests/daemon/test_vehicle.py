@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -58,6 +59,9 @@ class _Link:
         return state and replace(state, interpolated=self.now >= self.complete_ns)
 
     def trouble(self) -> str | None:
+        return None
+
+    def turns_before(self, stamp_ns: int, ages_ns: Sequence[int]) -> None:
         return None
 
     vehicle: AutopilotIdentity | None = None

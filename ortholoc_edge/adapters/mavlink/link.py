@@ -10,7 +10,7 @@ import socket
 import threading
 import traceback
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from types import TracebackType
 from typing import Any
 
@@ -35,6 +35,7 @@ from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity, AutopilotSta
 from ortholoc_edge.adapters.mavlink.transport import IN_LIMIT_BYTES, Transport, open_transport
 from ortholoc_edge.clock import Clock, wall_clock_ns
 from ortholoc_edge.errors import LinkError
+from ortholoc_edge.geometry.arrays import FloatArray
 
 logger = logging.getLogger(__name__)
 
@@ -207,6 +208,12 @@ class AutopilotLink:
         """
         with self._lock:
             return self._protocol.state_at(stamp_ns)
+
+    def turns_before(self, stamp_ns: int, ages_ns: Sequence[int]) -> FloatArray | None:
+        """How the body was turned some times before a stamp of our clock, against how it is at the stamp: (K, 3)
+        rotation vectors about the body's axes at the stamp. None where its attitude is not known at one of them."""
+        with self._lock:
+            return self._protocol.telemetry.turns_before(stamp_ns, ages_ns)
 
     @property
     def sinks(self) -> tuple[Sink, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -513,6 +513,24 @@ class Telemetry:
             turned = rotation.slerp(first, rotation.from_quaternion(b.quaternion), t)
             rates = (1.0 - t) * rates + t * np.array(b.rates_rad_s)
         return frozen_floats(turned, (3, 3), "ned_from_body"), frozen_floats(rates, (3,), "rates"), b is not None
+
+    def turns_before(self, stamp_ns: int, ages_ns: Sequence[int]) -> FloatArray | None:
+        """See :meth:`AutopilotLink.turns_before`."""
+        best = self._timesync.best(stamp_ns) if self._timesync.synchronised else None
+        time_ns = stamp_ns + best[0] if best is not None else stamp_ns
+        unconfirmed_ns = self._unconfirmed_after_ns
+        if best is not None and unconfirmed_ns is not None and time_ns > unconfirmed_ns:
+            return None
+        now, *_ = self._attitude_at(time_ns, best is not None)
+        if now is None:
+            return None
+        turns = np.empty((len(ages_ns), 3))
+        for row, age_ns in zip(turns, ages_ns, strict=True):
+            then, *_ = self._attitude_at(time_ns - age_ns, best is not None)
+            if then is None:
+                return None
+            row[:] = rotation.log(now.T @ then)
+        return turns
 
     def _odometry_at(self, time_ns: int, by_boot: bool) -> tuple[FloatArray | None, int]:
         before, after = self._odometry.around(time_ns, by_boot)
