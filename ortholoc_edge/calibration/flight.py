@@ -43,7 +43,8 @@ _TURNS, _PLACES, _FIXES, _STATES = slice(12, 15), slice(15, 18), slice(18, 24), 
 TURN_STEP_S = TURN_AGES_NS[0] * 1e-9
 # What no flight tells of: 1-sigma of how well TIMESYNC and the autopilot's own stamps relate its attitudes to our
 # clock; and by what the focal length's sigma is too small, since a climb is at one place, whose error of the map's
-# heights passes for a longer lens (error over sigma was 1.7 rms in six simulated flights over a map of another season).
+# heights passes for a longer lens (error over sigma was 1.7 rms in five simulated flights over a map of another
+# season).
 _CLOCKS_S, _FOCAL_FACTOR = 0.002, 2.0
 # Of an attitude, rad, and a GNSS position, m, from one frame to the next: interpolation, quantisation.
 _ATTITUDE_WHITE, _GNSS_WHITE = math.radians(0.05), 0.05
@@ -164,7 +165,7 @@ def focal_response_m(pose: Rigid3, camera: Camera, heights: Callable[[FloatArray
 
     Straight down that pose is a step along the optical axis; obliquely perspective holds the height, and the attitude
     gives way, too. Of the whole step only the height is used: sideways it goes with the tilt, and with all else that
-    goes with an acceleration. Taken in, six simulated flights had 0.5 % too little of the focal length, and a sigma
+    goes with an acceleration. Taken in, five simulated flights had 0.5 % too little of the focal length, and a sigma
     of 0.24 %.
 
     Args:

@@ -28,7 +28,7 @@ _GROUND_GSD_M = 4.0
 _MOST_GAP_NS = 600_000_000
 LEAST_FIXES = 40
 # What must be the same in all logs: what is looked for is against it.
-_SAME = ("intrinsics", "mount", "camera.latency_ms")
+_SAME = ("intrinsics", "mount", "camera")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,8 +99,8 @@ def read_flights(sources: Sequence[Path], pack: Path | None = None) -> Flown:
 def _require_same(configs: Sequence[Config], sources: Sequence[Path]) -> None:
     first, last = configs[0], configs[-1]
     pairs = zip(
-        _SAME, (first.intrinsics.camera(), first.mount, first.camera.latency_ms),
-        (last.intrinsics.camera(), last.mount, last.camera.latency_ms), strict=True,
+        _SAME, (first.intrinsics.camera(), first.mount, first.camera.lateness),
+        (last.intrinsics.camera(), last.mount, last.camera.lateness), strict=True,
     )  # fmt: skip
     for name, one, other in pairs:
         if one != other:

@@ -86,10 +86,10 @@ def figures(flown: Flown, found: FlightCalibration) -> list[Told]:
         for name, value, sigma, limit in zip(names, now, sigmas, limits, strict=True)
     ]
     late_ms, sigma_ms = 1e3 * found.value("late_s"), 1e3 * found.sigma("late_s")
-    latency_ms = flown.config.camera.latency_ms
+    key, latency_ms = flown.config.camera.lateness
     told.append(
         Told(
-            "camera.latency_ms", latency_ms, latency_ms + late_ms, sigma_ms, _MOST_LATE_MS, sigma_ms <= _MOST_LATE_MS,
+            f"camera.{key}", latency_ms, latency_ms + late_ms, sigma_ms, _MOST_LATE_MS, sigma_ms <= _MOST_LATE_MS,
             "turn and bank more: figures of eight at 20 degrees per second, faster and slower",
         )
     )  # fmt: skip
@@ -177,11 +177,12 @@ def _paste(flown: Flown, told: list[Told]) -> str:
         *(f"{name} = {by_name[f'mount.{name}']:.2f}" for name in ("roll_deg", "pitch_deg", "yaw_deg")),
         "", "[camera]",
     ]  # fmt: skip
-    latency_ms = by_name["camera.latency_ms"]
-    if latency_ms < 0.0:
-        lines.append(f"latency_ms = 0.0   # {latency_ms:.1f} was found: stamps are earlier than the exposure")
+    key, _ = flown.config.camera.lateness
+    latency_ms = by_name[f"camera.{key}"]
+    if key == "latency_ms" and latency_ms < 0.0:
+        lines.append(f"{key} = 0.0   # {latency_ms:.1f} was found: stamps are earlier than the exposure")
     else:
-        lines.append(f"latency_ms = {latency_ms:.1f}")
+        lines.append(f"{key} = {latency_ms:.1f}")
     intrinsics, factor = flown.config.intrinsics, by_name["intrinsics.focal"]
     scaled = msgspec.structs.replace(intrinsics, fx=intrinsics.fx * factor, fy=intrinsics.fy * factor)
     return "\n".join([*lines, "", toml_of(scaled.camera()).rstrip()])

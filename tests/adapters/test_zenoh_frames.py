@@ -18,7 +18,7 @@ import zenoh
 from ortholoc_edge.adapters.bus import Bus, BusOptions
 from ortholoc_edge.adapters.camera import BadFrameError, CameraOptions, EndOfFrames, open_source
 from ortholoc_edge.adapters.camera.zenoh_frames import ZenohFrames, unpack
-from ortholoc_edge.clock import SystemClock, wall_clock_ns
+from ortholoc_edge.clock import ManualClock, SystemClock, wall_clock_ns
 from ortholoc_edge.errors import CameraError, ConfigError
 from ortholoc_edge.pipeline.frame import Frame
 
@@ -162,6 +162,21 @@ def test_a_text_that_claims_gigabytes_is_refused() -> None:
         unpack(hostile)
 
 
+def test_stamps_are_corrected_or_not_believed() -> None:
+    bus = Bus(BusOptions(listen=()), takes_pictures=True)
+    try:
+        for stamps, late_ns in (("driver", 7 * MS), ("arrival", 30 * MS)):
+            options = CameraOptions(source=f"zenoh:{KEY}", latency_ms=30.0, driver_latency_ms=7.0, stamps=stamps)
+            source = ZenohFrames(bus, KEY, options, ManualClock(10**9))
+            source._arrived(jpeg(), json.dumps({"stamp_ns": 10**9 if stamps == "driver" else 5}).encode())
+            frame = source.read(0.0)
+            assert frame is not None and frame.stamp_ns == 10**9 - late_ns
+            assert source.restamped == 0
+            source.close()
+    finally:
+        bus.close()
+
+
 def test_needs_the_bus_and_a_key() -> None:
     with pytest.raises(ConfigError, match=r"\[bus\] enabled = true"):
         open_source(CameraOptions(source="zenoh:a/b"), SystemClock())
@@ -175,7 +190,7 @@ def test_needs_the_bus_and_a_key() -> None:
 
 def test_closing_ends_a_read() -> None:
     bus = Bus(BusOptions(listen=()), takes_pictures=True)
-    source = ZenohFrames(bus, KEY, SystemClock())
+    source = ZenohFrames(bus, KEY, CameraOptions(source=f"zenoh:{KEY}"), SystemClock())
     thread = threading.Timer(0.05, source.close)
     thread.start()
     with pytest.raises(EndOfFrames):

@@ -19,8 +19,6 @@ from ortholoc_edge.errors import ConfigError
 if TYPE_CHECKING:
     from ortholoc_edge.adapters.bus import Bus
 
-_MS = 1_000_000
-
 
 def open_source(options: CameraOptions, clock: Clock, bus: Bus | None = None) -> FrameSource:
     """The source that ``options.source`` names.
@@ -38,8 +36,7 @@ def open_source(options: CameraOptions, clock: Clock, bus: Bus | None = None) ->
     if kind == "zenoh" and rest:
         if bus is None:
             raise ConfigError(f"camera source {options.source!r} comes over the bus; set [bus] enabled = true")
-        exposure_ns = round(options.exposure_ms * _MS) if isinstance(options.exposure_ms, float) else None
-        return ZenohFrames(bus, rest, clock, round(options.latency_ms * _MS), exposure_ns)
+        return ZenohFrames(bus, rest, options, clock)
     name, opened = _live(kind, rest, options, clock)
     return DeviceSource(name, opened, clock)
 

@@ -20,7 +20,7 @@ class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         rate_hz: of a folder; asked of a camera whose ``fps`` is not given.
         latency_ms: of frames that are stamped when they arrive: from the middle of the exposure until the frame is
             handed over. Measure it, since at 20 m/s each 50 ms left out are a metre.
-        stamps: "driver": a device's own where they are of our clock, else as "arrival".
+        stamps: "driver": a device's own where they are of our clock, a publisher's own on the bus; else as "arrival".
         stamp_of: which moment the driver's stamps are of. "auto": as the driver says.
         driver_latency_ms: subtracted from the driver's stamps beyond what exposure and readout explain.
         exposure_ms: asked of a camera; of a stream, which can't be asked, as it was set there. Left out: as it is.
@@ -47,3 +47,11 @@ class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     height_px: Annotated[int, Meta(ge=16, le=16384)] | None = None
     fps: Annotated[float, Meta(gt=0, le=1000)] | None = None
     realtime: bool = True
+
+    @property
+    def lateness(self) -> tuple[Literal["driver_latency_ms", "latency_ms"], float]:
+        """Which key corrects the stamps of this source, and its value."""
+        kind = self.source.partition(":")[0]
+        if self.stamps == "driver" and kind in ("device", "picamera2", "gstreamer", "zenoh"):
+            return "driver_latency_ms", self.driver_latency_ms
+        return "latency_ms", self.latency_ms

@@ -7,8 +7,9 @@ Two forms are understood:
 - ROS 2's ``sensor_msgs/msg/CompressedImage``, as zenoh-plugin-ros2dds and rmw_zenoh carry it (CDR). Its header has the
   date.
 
-The time is that of mid-exposure. Where it is missing, or can't be (in the future, or seconds old: the clock of another
-computer, or one that was set meanwhile), the frame is stamped as it arrives, less ``latency_ms``.
+The time is that of mid-exposure, less ``driver_latency_ms``. Where it is missing, or can't be (in the future, or
+seconds old: the clock of another computer, or one that was set meanwhile), the frame is stamped as it arrives, less
+``latency_ms``.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 from msgspec import Meta
 
+from ortholoc_edge.adapters.camera.options import CameraOptions
 from ortholoc_edge.adapters.camera.pictures import decode_image
 from ortholoc_edge.adapters.camera.source import BadFrameError, EndOfFrames
 from ortholoc_edge.clock import Clock, wall_clock_ns
@@ -34,7 +36,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-_S = 1_000_000_000
+_MS, _S = 1_000_000, 1_000_000_000
 # Of a stamp against its arrival: two computers' clocks agree no better, and nothing is that long under way.
 _MOST_AHEAD_NS, _MOST_AGE_NS = 5_000_000, 3 * _S
 # The first bytes of the pictures that OpenCV reads; a message of ROS begins with its encapsulation.
@@ -73,20 +75,20 @@ class ZenohFrames:
         self,
         bus: Bus,
         key: str,
+        options: CameraOptions,
         clock: Clock,
-        latency_ns: int = 0,
-        exposure_ns: int | None = None,
         wall_ns: Callable[[], int] = wall_clock_ns,
     ) -> None:
         """
         Args:
-            latency_ns: subtracted from the arrival of what has no time of its own.
-            exposure_ns: of pictures that do not say theirs; None where it is not known.
+            options: its latencies, which stamps to believe, and the exposure of pictures that do not say theirs.
             wall_ns: the date, nanoseconds since 1970.
         Raises: ConfigError if ``key`` is no key expression.
         """
-        self._key, self._clock, self._latency_ns, self._wall_ns = key, clock, latency_ns, wall_ns
-        self._exposure_ns = exposure_ns
+        self._key, self._clock, self._wall_ns = key, clock, wall_ns
+        self._latency_ns, self._own_late_ns = round(options.latency_ms * _MS), round(options.driver_latency_ms * _MS)
+        self._believes_stamps = options.stamps == "driver"
+        self._exposure_ns = round(options.exposure_ms * _MS) if isinstance(options.exposure_ms, float) else None
         self._condition = threading.Condition()
         self._waiting: tuple[int, bytes, bytes] | None = None
         self._closed = False
@@ -126,11 +128,13 @@ class ZenohFrames:
         return Frame(stamp_ns, image, name, picture.exposure_ns or self._exposure_ns)
 
     def _stamp(self, picture: CompressedPicture, arrived_ns: int) -> int:
+        if not self._believes_stamps:
+            return arrived_ns - self._latency_ns
         stamp_ns = picture.stamp_ns
         if stamp_ns is None and picture.unix_ns is not None:
             stamp_ns = picture.unix_ns - (self._wall_ns() - self._clock.now_ns())
         if stamp_ns is not None and -_MOST_AHEAD_NS <= arrived_ns - stamp_ns <= _MOST_AGE_NS:
-            return stamp_ns
+            return stamp_ns - self._own_late_ns
         self.restamped += 1
         if not self._is_told:
             self._is_told = True
