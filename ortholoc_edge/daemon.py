@@ -23,7 +23,7 @@ from msgspec import structs
 
 from ortholoc_edge.adapters import systemd
 from ortholoc_edge.adapters.bus import Bus, bus_of
-from ortholoc_edge.adapters.camera import BadFrameError, DeviceSource, EndOfFrames, FrameSource, open_source
+from ortholoc_edge.adapters.camera import BadFrameError, Counting, EndOfFrames, FrameSource, open_source
 from ortholoc_edge.adapters.commands import Answer, BusyError, Desk
 from ortholoc_edge.adapters.computer import ComputerReader
 from ortholoc_edge.adapters.flight_log import FlightLog
@@ -199,7 +199,7 @@ class Daemon:
                 self._commander,
                 computer or ComputerReader(),
                 replaced=lambda: self._slot.replaced,
-                camera=lambda: self._frames.counts() if isinstance(self._frames, DeviceSource) else {},
+                camera=lambda: self._frames.counts() if isinstance(self._frames, Counting) else {},
                 unix_minus_stamp_ns=self._unix_minus_stamp_ns,
                 bus=self._bus,
                 log=self._log,

@@ -8,9 +8,9 @@ from ortholoc_edge.adapters.camera.live import DeviceSource
 from ortholoc_edge.adapters.camera.opening import open_source
 from ortholoc_edge.adapters.camera.options import CameraOptions
 from ortholoc_edge.adapters.camera.pictures import IMAGE_SUFFIXES, read_image
-from ortholoc_edge.adapters.camera.source import BadFrameError, EndOfFrames, FrameSource
+from ortholoc_edge.adapters.camera.source import BadFrameError, Counting, EndOfFrames, FrameSource
 
 __all__ = [
-    "IMAGE_SUFFIXES", "BadFrameError", "CameraOptions", "DeviceSource", "EndOfFrames", "FolderSource", "FrameSource",
-    "VideoSource", "open_source", "read_image",
+    "IMAGE_SUFFIXES", "BadFrameError", "CameraOptions", "Counting", "DeviceSource", "EndOfFrames", "FolderSource",
+    "FrameSource", "VideoSource", "open_source", "read_image",
 ]  # fmt: skip

@@ -42,6 +42,13 @@ def decode_image(data: bytes, name: str, remedy: str) -> ImageArray:
     return decoded
 
 
+def decode_published(data: bytes, name: str, remedy: str) -> ImageArray:
+    """As `decode_image`, of what anybody may have sent: only formats whose size is known before they are decoded."""
+    if declared_px(data) is None:
+        raise CameraError(f"{name} is unusable: neither JPEG, PNG nor WebP; {remedy}")
+    return decode_image(data, name, remedy)
+
+
 def decode(data: bytes) -> ImageArray | str:
     """An encoded picture as (H, W, 3) RGB uint8, read-only, or in words why it can't be."""
     defect = _defect(data)
@@ -80,6 +87,9 @@ def _defect(data: bytes) -> str | None:
     """What is visibly wrong with an encoded picture, before anything decodes it; None if nothing is."""
     if not data:
         return "it is empty"
+    size = declared_px(data)
+    if size is not None and size[0] * size[1] > _MOST_PX:
+        return f"of {size[0]} x {size[1]} pixels; at most {_MOST_PX / 1e6:.0f} million can be taken"
     if data.startswith(b"\xff\xd8"):
         return _jpeg_defect(data)
     if data.startswith(b"\x89PNG\r\n\x1a\n"):
@@ -89,9 +99,44 @@ def _defect(data: bytes) -> str | None:
     return None
 
 
+# What a decoder takes memory for, 3 bytes each: larger than any camera's, smaller than what ends the daemon.
+_MOST_PX = 150_000_000
+# Starts of frames (SOF0 to SOF15; the three left out are tables).
+_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 # In entropy-coded data FF is followed by 00 (a stuffed byte), by a restart marker or by more FF; else a
 # segment begins.
 _JPEG_NEXT_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
+
+
+def declared_px(data: bytes) -> tuple[int, int] | None:
+    """Width and height that a JPEG, PNG or WebP says it has; None of anything else, (0, 0) where it breaks off."""
+    if data.startswith(b"\xff\xd8"):
+        return _jpeg_px(data)
+    if data.startswith(b"\x89PNG\r\n\x1a\n"):
+        return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+        kind, body = data[12:16], data[20:30]
+        if kind == b"VP8X":
+            return int.from_bytes(body[4:7], "little") + 1, int.from_bytes(body[7:10], "little") + 1
+        if kind == b"VP8L":
+            packed = int.from_bytes(body[1:5], "little")
+            return (packed & 0x3FFF) + 1, (packed >> 14 & 0x3FFF) + 1
+        return int.from_bytes(body[6:8], "little") & 0x3FFF, int.from_bytes(body[8:10], "little") & 0x3FFF
+    return None
+
+
+def _jpeg_px(data: bytes) -> tuple[int, int]:
+    """By the segments, since an EXIF thumbnail has a size of its own."""
+    at = 2
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker == 0xFF:  # fill
+            at += 1
+        elif marker in _JPEG_FRAMES:
+            return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
+        else:
+            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return 0, 0
 
 
 def _jpeg_defect(data: bytes) -> str | None:

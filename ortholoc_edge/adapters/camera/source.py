@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from ortholoc_edge.errors import CameraError
 from ortholoc_edge.pipeline.frame import Frame
@@ -37,4 +37,13 @@ class FrameSource(Protocol):
 
     def close(self) -> None:
         """Release the device. Idempotent; `read` in another thread returns."""
+        ...
+
+
+@runtime_checkable
+class Counting(Protocol):
+    """A live source, which loses frames on the way."""
+
+    def counts(self) -> dict[str, int]:
+        """What was lost since the start, by name; for the statistics."""
         ...

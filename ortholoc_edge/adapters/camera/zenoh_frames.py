@@ -7,9 +7,9 @@ Two forms are understood:
 - ROS 2's ``sensor_msgs/msg/CompressedImage``, as zenoh-plugin-ros2dds and rmw_zenoh carry it (CDR). Its header has the
   date.
 
-The time is that of mid-exposure, less ``driver_latency_ms``. Where it is missing, or can't be (in the future, or
-seconds old: the clock of another computer, or one that was set meanwhile), the frame is stamped as it arrives, less
-``latency_ms``.
+The time is that of mid-exposure, less ``driver_latency_ms``. Without one, and where five in a row can't be (in the
+future, a second old, not later than the one before: the clock of another computer, or one that was set meanwhile),
+frames are stamped as they arrive, less ``latency_ms``.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ import msgspec
 from msgspec import Meta
 
 from ortholoc_edge.adapters.camera.options import CameraOptions
-from ortholoc_edge.adapters.camera.pictures import decode_image
+from ortholoc_edge.adapters.camera.pictures import decode_published
 from ortholoc_edge.adapters.camera.source import BadFrameError, EndOfFrames
+from ortholoc_edge.adapters.camera.stamps import DriverStamps
 from ortholoc_edge.clock import Clock, wall_clock_ns
 from ortholoc_edge.errors import CameraError
 from ortholoc_edge.pipeline.frame import Frame
@@ -37,19 +38,23 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _MS, _S = 1_000_000, 1_000_000_000
-# Of a stamp against its arrival: two computers' clocks agree no better, and nothing is that long under way.
-_MOST_AHEAD_NS, _MOST_AGE_NS = 5_000_000, 3 * _S
-# The first bytes of the pictures that OpenCV reads; a message of ROS begins with its encapsulation.
+# A camera that is silent for so long is told of; more seldom than it is asked for anything else.
+_SILENT_NS = 3 * _S
+# A message of ROS begins with its encapsulation, and no picture does so.
 _CDR_BIG, _CDR_LITTLE = b"\x00\x00", b"\x00\x01"
 _MOST_TEXT_BYTES = 4096
+_MOST_ATTACHED_BYTES = 4096
 _REMEDY = "look at the program that publishes it"
+
+# What whoever reaches the bus may write must fit into messages and logs.
+_Nanoseconds = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 
 
 class _Attachment(msgspec.Struct, frozen=True):
-    stamp_ns: int | None = None
-    unix_ns: int | None = None
-    exposure_ns: Annotated[int, Meta(gt=0)] | None = None
-    name: str | None = None
+    stamp_ns: _Nanoseconds | None = None
+    unix_ns: _Nanoseconds | None = None
+    exposure_ns: Annotated[int, Meta(gt=0, le=10 * _S)] | None = None
+    name: Annotated[str, Meta(max_length=128)] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,12 +68,22 @@ class CompressedPicture:
     name: str | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class _Arrival:
+    """``wall_minus_ns``: what made dates of stamps then, since the date may be set before it is looked at."""
+
+    stamp_ns: int
+    wall_minus_ns: int
+    payload: bytes
+    attachment: bytes
+
+
 class ZenohFrames:
     """A `FrameSource`: the newest picture that was published, older ones are overwritten and counted.
 
     Attributes:
         overwritten: pictures that a newer one replaced before they were read.
-        restamped: whose own time was missing or can't be.
+        damaged: that could not be decoded. disordered: left out for their time.
     """
 
     def __init__(
@@ -87,23 +102,30 @@ class ZenohFrames:
         """
         self._key, self._clock, self._wall_ns = key, clock, wall_ns
         self._latency_ns, self._own_late_ns = round(options.latency_ms * _MS), round(options.driver_latency_ms * _MS)
-        self._believes_stamps = options.stamps == "driver"
-        self._exposure_ns = round(options.exposure_ms * _MS) if isinstance(options.exposure_ms, float) else None
+        self._stamps = DriverStamps()
+        self._stamps.believed = options.stamps == "driver"
+        self._exposure_ns = round(options.exposure_ms * _MS) if isinstance(options.exposure_ms, float | int) else None
         self._condition = threading.Condition()
-        self._waiting: tuple[int, bytes, bytes] | None = None
+        self._waiting: _Arrival | None = None
         self._closed = False
         self._number = 0
-        self._is_told = False
-        self.overwritten = self.restamped = 0
+        self._heard_ns = clock.now_ns()
+        self._told: set[str] = set()
+        self.overwritten = self.damaged = self.disordered = 0
         self._stop = bus.listen_to(key, self._arrived)
 
     def _arrived(self, payload: bytes, attachment: bytes) -> None:
         """In a thread of the bus."""
-        arrived_ns = self._clock.now_ns()
+        now_ns = self._clock.now_ns()
+        arrival = _Arrival(now_ns, self._wall_ns() - now_ns, payload, attachment)
         with self._condition:
             self.overwritten += self._waiting is not None
-            self._waiting = arrived_ns, payload, attachment
+            self._waiting = arrival
             self._condition.notify()
+
+    def counts(self) -> dict[str, int]:
+        """See `Counting.counts`."""
+        return {"overwritten": self.overwritten, "damaged": self.damaged, "disordered": self.disordered}
 
     def read(self, timeout_s: float) -> Frame | None:
         """See `FrameSource.read`."""
@@ -111,41 +133,51 @@ class ZenohFrames:
             self._condition.wait_for(lambda: self._waiting is not None or self._closed, timeout_s)
             if self._closed:
                 raise EndOfFrames
-            item, self._waiting = self._waiting, None
-        if item is None:
+            arrival, self._waiting = self._waiting, None
+        if arrival is None:
+            if self._clock.now_ns() - self._heard_ns > _SILENT_NS:
+                self._tell("silent", "no picture for %g s; check the key and who publishes it", _SILENT_NS / _S)
             return None
-        arrived_ns, payload, attachment = item
+        self._heard_ns = arrival.stamp_ns
+        self._told.discard("silent")
         self._number += 1
-        where = f"zenoh:{self._key}"
-        stamp_ns, name = arrived_ns - self._latency_ns, str(self._number)
+        stamp_ns, name = arrival.stamp_ns - self._latency_ns, str(self._number)
         try:
-            picture = unpack(payload, attachment)
+            picture = unpack(arrival.payload, arrival.attachment)
             name = picture.name or name
-            stamp_ns = self._stamp(picture, arrived_ns)
-            image = decode_image(picture.data, f"picture {name} of {where}", _REMEDY)
+            stamp_ns = self._stamp(picture, arrival)
+            image = decode_published(picture.data, f"picture {name} of zenoh:{self._key}", _REMEDY)
         except CameraError as error:
+            self.damaged += 1
             raise BadFrameError(str(error), stamp_ns, name) from error
         return Frame(stamp_ns, image, name, picture.exposure_ns or self._exposure_ns)
 
-    def _stamp(self, picture: CompressedPicture, arrived_ns: int) -> int:
-        if not self._believes_stamps:
-            return arrived_ns - self._latency_ns
-        stamp_ns = picture.stamp_ns
-        if stamp_ns is None and picture.unix_ns is not None:
-            stamp_ns = picture.unix_ns - (self._wall_ns() - self._clock.now_ns())
-        if stamp_ns is not None and -_MOST_AHEAD_NS <= arrived_ns - stamp_ns <= _MOST_AGE_NS:
-            return stamp_ns - self._own_late_ns
-        self.restamped += 1
-        if not self._is_told:
-            self._is_told = True
-            why = (
-                "have no time of their own"
-                if stamp_ns is None
-                else f"are stamped {(arrived_ns - stamp_ns) / 1e6:.0f} ms before they arrive, which can't be; set the "
-                "clock of the computer that publishes them"
+    def _stamp(self, picture: CompressedPicture, arrival: _Arrival) -> int:
+        """Raises: CameraError for a time that can't be."""
+        by_arrival_ns = arrival.stamp_ns - self._latency_ns
+        own_ns = picture.stamp_ns
+        if own_ns is None and picture.unix_ns is not None:
+            own_ns = picture.unix_ns - arrival.wall_minus_ns
+        if own_ns is None or not self._stamps.believed:
+            if own_ns is None:
+                self._tell("no time", "pictures have no time of their own; they are stamped when they arrive")
+            return by_arrival_ns
+        if self._stamps.judge(own_ns, arrival.stamp_ns):
+            return own_ns - self._own_late_ns
+        late_s = (arrival.stamp_ns - own_ns) / _S
+        if self._stamps.believed:
+            self.disordered += 1
+            raise CameraError(
+                f"picture of zenoh:{self._key} is stamped {late_s:.3f} s before it arrived, or not after the one "
+                "before; set the clock of the computer that publishes it"
             )
-            logger.warning("camera zenoh:%s: pictures %s; their arrival counts, less latency_ms", self._key, why)
-        return arrived_ns - self._latency_ns
+        self._tell("no clock", "stamps are not of our clock (%.3f s before arrival); they are not believed", late_s)
+        return by_arrival_ns
+
+    def _tell(self, what: str, text: str, *values: float) -> None:
+        if what not in self._told:
+            self._told.add(what)
+            logger.warning(f"camera zenoh:%s: {text}", self._key, *values)
 
     def close(self) -> None:
         """See `FrameSource.close`."""
@@ -159,11 +191,11 @@ def unpack(payload: bytes, attachment: bytes = b"") -> CompressedPicture:
     """A message of either form. Raises: CameraError."""
     if payload[:2] in (_CDR_BIG, _CDR_LITTLE):
         return _compressed_image(payload)
-    if not attachment:
+    if not attachment or len(attachment) > _MOST_ATTACHED_BYTES:
         return CompressedPicture(payload)
     try:
         said = msgspec.json.decode(attachment, type=_Attachment)
-    except (msgspec.DecodeError, msgspec.ValidationError):
+    except (msgspec.DecodeError, msgspec.ValidationError, RecursionError):
         # Of somebody else's making (rmw_zenoh has one, too): the picture is still a picture.
         return CompressedPicture(payload)
     return CompressedPicture(payload, said.stamp_ns, said.unix_ns, said.exposure_ns, said.name)
