@@ -13,6 +13,7 @@ import contextlib
 import json
 import logging
 import re
+import socket
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -115,7 +116,7 @@ class Bus:
         dropped: messages that could not be published.
         refused: commands that were not carried out.
     Raises on construction: ConfigError if an endpoint is malformed; LinkError if no session can be had. A port that is
-        in use is waited for, in the background.
+        in use, or an address that is not there yet, is waited for in the background.
     """
 
     def __init__(self, options: BusOptions, credentials: Path | None = None, *, takes_pictures: bool = False) -> None:
@@ -182,7 +183,7 @@ class Bus:
         try:
             return zenoh.open(config)
         except zenoh.ZError as err:
-            if not self._options.listen:
+            if not any(_can_not_be_had(endpoint) for endpoint in self._options.listen):
                 raise
             # A port that another program holds, or an interface that is not up yet: no reason not to fly.
             logger.warning("%s; flying without who connects there, it is tried again and again", self._not_open(err))
@@ -192,8 +193,8 @@ class Bus:
 
     def _not_open(self, err: zenoh.ZError) -> LinkError:
         return LinkError(
-            f"zenoh can't listen on {', '.join(self._options.listen)} as {self._prefix!r} ({err}); free the port, or "
-            "choose another in [bus] of the configuration"
+            f"zenoh can't listen on {', '.join(self._options.listen)} as {self._prefix!r} ({err}); free the port "
+            "or choose another in [bus] of the configuration; else look at its certificates and [bus] config"
         )
 
     def listen_to(self, key: str, handler: Callable[[bytes, bytes], None]) -> Callable[[], None]:
@@ -427,6 +428,26 @@ def _tls_settings(tls: TlsOptions, credentials: Path | None) -> dict[str, Any]:
     settings: dict[str, Any] = {f"transport/link/tls/{key}": path for name, path in paths.items() for key in keys[name]}
     settings["transport/link/tls/enable_mtls"] = tls.mutual
     return settings
+
+
+def _can_not_be_had(endpoint: str) -> bool:
+    """Whether its port is another's now, or its address nobody's on this computer. zenoh tells of that as of a wrong
+    certificate, which no waiting mends."""
+    protocol, _, address = endpoint.partition("/")
+    host, _, rest = address.partition("#")[0].rpartition(":")
+    if protocol not in _PORT_PROTOCOLS:
+        return False
+    kind = socket.SOCK_DGRAM if protocol in ("udp", "quic") else socket.SOCK_STREAM
+    try:
+        found = socket.getaddrinfo(host.strip("[]"), int(rest.partition("?")[0]), type=kind)
+        family, kind, number, _, at = found[0]
+        with socket.socket(family, kind, number) as probe:
+            # As zenoh does: what ended a moment ago is not in the way.
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(at)
+    except OSError:
+        return True
+    return False
 
 
 def _well_formed(endpoint: str) -> bool:

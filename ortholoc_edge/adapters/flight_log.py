@@ -256,8 +256,7 @@ class FlightLog:
     def _run(self) -> None:
         while (entry := self._queue.get()) is not None:
             try:
-                self._write(entry)
-                self._failing = False
+                self._failing = not self._write(entry) and self._failing
             except OSError as err:
                 self._give_up(entry, err)
             except Exception:  # a defect of logging must end neither the thread nor the flight
@@ -282,11 +281,12 @@ class FlightLog:
             logger.warning("%s: can't write the log (%s); frames are dropped until it works", self._folder, err)
         self._failing = True
 
-    def _write(self, entry: _Entry | _Note) -> None:
+    def _write(self, entry: _Entry | _Note) -> bool:
+        """Whether it was; not while the last failure is fresh."""
         if self._file is None:
             if abs(_stamp_ns(entry) - self._failed_ns) < _AGAIN_AFTER_NS:
                 self.dropped += isinstance(entry, _Entry)
-                return
+                return False
             self._failed_ns = _stamp_ns(entry)
             self._file = self._open()
         if isinstance(entry, _Entry):
@@ -298,6 +298,7 @@ class FlightLog:
             whole, self._file = self._file, None
             whole.finish()
             self._file = self._open()
+        return True
 
     def _write_frame(self, file: _File, entry: _Entry) -> None:
         outcome = entry.outcome

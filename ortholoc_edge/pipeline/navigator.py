@@ -12,7 +12,7 @@ from ortholoc_edge.pipeline.frame import Frame, VehicleState
 from ortholoc_edge.pipeline.gate import GateOptions
 from ortholoc_edge.pipeline.ladder import Ladder, LadderOptions
 from ortholoc_edge.pipeline.localizer import Localizer
-from ortholoc_edge.pipeline.outcome import Outcome, Rejected
+from ortholoc_edge.pipeline.outcome import Fix, Outcome, Rejected
 from ortholoc_edge.pipeline.picture import PictureOptions, Seen, Watch, grey_rows, motion_px_s, unfit
 from ortholoc_edge.pipeline.prior import PosePrior
 from ortholoc_edge.pipeline.tracker import Order, Tracker, TrackerOptions
@@ -118,10 +118,12 @@ class Navigator:
         """What the frame comes to, given the vehicle's state at its exposure. ``proceed``: see `Localizer.localize`."""
         outcome = self._step(frame, state, proceed, self.ladder.detail)
         took_ms = outcome.timings_ms
-        # A frame that was refused before anything was matched took no time. A search by features, for one that
-        # structural matching can't place, takes long on any rung.
-        if "match" in took_ms:
-            self.ladder.note(took_ms.get("structural", took_ms["total"]), frame.stamp_ns)
+        # A frame that was refused before anything was matched took no time. A search by features takes long on any
+        # rung, and detail is what it needs: where structural matching did not say how long frames take, fixes do.
+        if "structural" in took_ms:
+            self.ladder.note(took_ms["structural"], frame.stamp_ns)
+        elif "match" in took_ms and isinstance(outcome, Fix):
+            self.ladder.note(took_ms["total"], frame.stamp_ns)
         return outcome
 
     def step_again(self, frame: Frame, state: VehicleState, was: Circumstances) -> Outcome:

@@ -41,7 +41,7 @@ from ortholoc_edge.adapters.messages import (
     fix_message,
     rejection_message,
 )
-from ortholoc_edge.errors import ConfigError
+from ortholoc_edge.errors import ConfigError, LinkError
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.rigid import Rigid3
@@ -656,6 +656,14 @@ def test_with_mutual_tls_certificates_say_who_may_what(certificates: Path, tmp_p
 def test_certificates_that_are_not_there(tls: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         Bus(BusOptions(listen=(f"tls/127.0.0.1:{free_port()}",), tls=TlsOptions(**tls)))
+
+
+def test_a_key_that_is_none_is_not_taken_for_a_port_in_use(certificates: Path, tmp_path: Path) -> None:
+    """No waiting mends it."""
+    (tmp_path / "wrong.key").write_text("no key", encoding="utf-8")
+    tls = TlsOptions(certificate=str(certificates / "vehicle.pem"), private_key=str(tmp_path / "wrong.key"))
+    with pytest.raises(LinkError, match="look at its certificates"):
+        Bus(BusOptions(enabled=True, listen=(f"tls/127.0.0.1:{free_port()}",), tls=tls)).close()
 
 
 @pytest.mark.parametrize("tls", [{"certificate": "a"}, {"private_key": "a"}, {"mutual": True}, {"roots": "a"}])
