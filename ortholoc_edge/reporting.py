@@ -189,9 +189,8 @@ class Reporter:
             lambda: self._switch_sources(self._navigator.tracker.witness.report.state, now_ns),
         )
         computer = self._computer.read()
-        # A weak supply throttles, too, but no load that is spared cures it.
-        is_hot = computer.is_hot or (computer.is_throttled and not computer.is_under_voltage)
-        self._navigator.ladder.observe(Strain(computer.load_percent, computer.processor_c, is_hot), now_ns)
+        strain = Strain(computer.load_percent, computer.processor_c, computer.is_strained)
+        self._navigator.ladder.observe(strain, now_ns)
         self._tell("the autopilot", lambda: self._report_autopilot(now_ns))
         self._link.report_computer(computer)
         if self._link.connected():

@@ -43,6 +43,11 @@ class ComputerStatus:
         """Of all cores together; None at the first reading."""
         return sum(self.cpu_percent) / len(self.cpu_percent) if self.cpu_percent else None
 
+    @property
+    def is_strained(self) -> bool:
+        """Hot, or slowed down by what less work would cure; of a weak supply it would not."""
+        return self.is_hot or (self.is_throttled and not self.is_under_voltage)
+
 
 def parse_cpu_times(stat: str) -> dict[str, tuple[int, int]]:
     """(busy, all) jiffies of each core, by its name in /proc/stat, "cpu3" say."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import multiprocessing
 import statistics
 import time
@@ -14,9 +15,10 @@ from typing import Any
 
 from ortholoc_edge.bench.flight_log import log_files, read_frames, read_header
 from ortholoc_edge.bench.metrics import Spread
-from ortholoc_edge.errors import DatasetError
+from ortholoc_edge.errors import DatasetError, OrtholocError
 from ortholoc_sim.browser import watch
 from ortholoc_sim.rig import Rig, RigOptions
+from ortholoc_sim.service_faults import WRONG_M
 from ortholoc_sim.supervised import vitals
 
 _EVERY_S = 10.0
@@ -25,6 +27,7 @@ SETTLED_S = 300.0
 # Of the beginning, once settled, and of the end; a shorter soak has windows of a quarter of what is left.
 _WINDOW_S = 600.0
 _LOG_MB = 64
+_LEAST_FIXED = 0.9
 _MIB = 2**20
 
 
@@ -107,14 +110,19 @@ def soak(
     with ExitStack() as resources:
         rig = resources.enter_context(Rig(out / "rig", options))
         rig.wait_for(lambda: rig.supervisor.is_ready, "READY=1")
-        begun_s = time.monotonic()
+        begun_s, looks = time.monotonic(), 0
         resources.callback(_watched(rig.page_port))
         file = resources.enter_context((out / "soak.csv").open("w", newline="", encoding="utf-8"))
         table = csv.DictWriter(file, [field.name for field in fields(Moment)])
         table.writeheader()
         while time.monotonic() - begun_s < seconds:
-            rig.fly_until(begun_s + len(moments) * _EVERY_S)
-            moment = _look(rig, time.monotonic() - begun_s)
+            rig.fly_until(begun_s + looks * _EVERY_S)
+            looks += 1
+            try:
+                moment = _look(rig, time.monotonic() - begun_s)
+            except OrtholocError:
+                # Between two lives; that it has a second one is counted at the end.
+                continue
             moments.append(moment)
             table.writerow(asdict(moment))
             file.flush()
@@ -123,7 +131,8 @@ def soak(
         restarts = rig.supervisor.count("started") - 1
         pause_s, watchdog_s = rig.supervisor.longest_pause_s, rig.supervisor.rules.watchdog_s
         exit_code = rig.stop_daemon()
-        errors = [fix.error_m for fix in rig.fixes if fix.error_m is not None]
+        # Of one whose time is nowhere near the flight's there is no error to tell.
+        errors = [math.inf if fix.error_m is None else fix.error_m for fix in rig.fixes]
         logs = _logs(rig.log_folder)
     return _report(moments, hours, rate_hz, errors, restarts, pause_s, watchdog_s, exit_code, logs, counters)
 
@@ -206,6 +215,12 @@ def _report(
     threads = median(first, "threads"), median(last, "threads")
     descriptors = median(first, "descriptors"), median(last, "descriptors")
     problems = []
+    if not errors or moments[-1].fixes < _LEAST_FIXED * (moments[-1].fixes + moments[-1].rejected):
+        problems.append(f"{moments[-1].fixes} fixes, {moments[-1].rejected} frames without one")
+    if errors and max(errors) > WRONG_M:
+        problems.append(f"a fix was {max(errors):.1f} m off")
+    if counters.get("report_errors"):
+        problems.append(f"{counters['report_errors']} errors of reporting")
     if growth > 0.05:
         problems.append(f"memory grew by {growth:.1%}")
     if threads[1] > threads[0]:

@@ -218,7 +218,9 @@ class Supervisor:
             elif code is not None:
                 self._note("ended", _cause(code))
                 self._is_ready = False
-                if code == 0 or code in self.rules.for_good:
+                # systemd takes these signals for a clean end.
+                clean = (0, -signal.SIGHUP, -signal.SIGINT, -signal.SIGTERM, -signal.SIGPIPE)
+                if code in clean or code in self.rules.for_good:
                     return
                 self._again_s = now_s + self.rules.restart_s
             elif self._kill_s is not None:

@@ -2,18 +2,25 @@
 
 import itertools
 import math
+from dataclasses import replace
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pipeline.scenes_pipeline import fix
 from replay import rendered
 
+from ortholoc_edge.adapters.computer import ComputerStatus
 from ortholoc_edge.matching.sift import SiftMatcher
 from ortholoc_edge.matching.types import Structural
 from ortholoc_edge.pipeline import structural
+from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.ladder import Cause, Ladder, LadderOptions, Strain
 from ortholoc_edge.pipeline.localizer import FEATURE_SCALES, Localizer, LocalizerOptions
-from ortholoc_edge.pipeline.outcome import Fix
+from ortholoc_edge.pipeline.navigator import Navigator
+from ortholoc_edge.pipeline.outcome import Fix, Reason, Rejected
 
 S = 1_000_000_000
 FRAME_NS = S // 5
@@ -34,6 +41,38 @@ def observed(ladder: Ladder, strain: Strain, seconds: int, first: int = 0) -> li
         ladder.observe(strain, second * S)
         rungs.append(ladder.rung)
     return rungs
+
+
+@pytest.mark.parametrize(
+    ("flags", "strained"),
+    [
+        ((False, True, False), True), ((True, True, False), False), ((True, True, True), True),
+        ((True, False, False), False),
+    ],
+)  # fmt: skip
+def test_a_weak_supply_is_no_heat(flags: tuple[bool, bool, bool], strained: bool) -> None:
+    """Fewer frames would cost positions and mend nothing."""
+    assert ComputerStatus((), 0, 0, (), *flags).is_strained is strained
+
+
+def test_a_search_by_features_takes_no_detail_from_what_searches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes as long as it may on any rung."""
+
+    def noted(structural_ms: float | None, total_ms: float, found: bool) -> int:
+        timings = {"match": total_ms / 2, "total": total_ms}
+        if structural_ms is not None:
+            timings["structural"] = structural_ms
+        outcome = fix((0.0, 0.0, 0.0)) if found else Rejected(0, Reason.FEW_INLIERS, "lost")
+        navigator = Navigator(SimpleNamespace(rungs=3), SimpleNamespace(), 100.0)  # type: ignore[arg-type]
+        monkeypatch.setattr(navigator, "_step", lambda *_: replace(outcome, timings_ms=timings))
+        for number in range(10):
+            navigator.step(Frame(number * FRAME_NS, np.zeros((4, 4), np.uint8), ""), None)  # type: ignore[arg-type]
+        return navigator.ladder.rung
+
+    assert noted(None, 1000.0, found=False) == 0
+    assert noted(None, 150.0, found=True) == 2
+    assert noted(40.0, 1000.0, found=False) == 0
+    assert noted(150.0, 160.0, found=False) == 2
 
 
 # -- time --------------------------------------------------------------------------------------------------
