@@ -22,6 +22,8 @@ _BACKOFF_MIN_S, _BACKOFF_MAX_S = 0.5, 2.0
 # A camera that fails this often in a row, or gives nothing for so long, is opened anew.
 _MAX_FAILED_GRABS = 5
 _SILENT_NS = 2 * _S
+# No driver waits for so long that lets go at all: opening takes 5 s, a frame 3; a name that nobody resolves up to 20.
+_HUNG_NS = 20 * _S
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +63,7 @@ class DeviceSource:
     queued one.
 
     A device that is missing, pulled out or silent is opened again with a growing pause; meanwhile `read`
-    returns None.
+    returns None. Where its driver keeps the thread, `read` raises CameraError: nothing but another process helps.
     """
 
     def __init__(self, name: str, opened: Callable[[], OpenCamera | None], clock: Clock) -> None:
@@ -81,6 +83,7 @@ class DeviceSource:
         self.failed_grabs = 0
         self.damaged = 0
         self._number = 0
+        self._beat_ns = clock.now_ns()
         self._thread = threading.Thread(target=self._run, name="camera", daemon=True)
         self._thread.start()
 
@@ -109,6 +112,12 @@ class DeviceSource:
             if self._failure is not None:
                 raise CameraError(f"camera {self._name}: its thread ended; see the log") from self._failure
             latest, self._latest = self._latest, None
+        hung_ns = self._clock.now_ns() - self._beat_ns
+        if latest is None and hung_ns > _HUNG_NS:
+            raise CameraError(
+                f"camera {self._name}: its driver has not come back for {hung_ns / _S:.0f} s; start the program afresh, "
+                "as systemd does, and look at cable and supply if that does not help"
+            )
         if isinstance(latest, BadFrameError):
             raise latest
         return latest
@@ -137,12 +146,14 @@ class DeviceSource:
         backoff_s = _BACKOFF_MIN_S
         failures = 0
         while not self._stop.is_set():
+            self._beat_ns = self._clock.now_ns()
             camera = self._opened()
             if camera is not None:
                 before = self._number
                 try:
                     self._grab_until_broken(camera)
                 finally:
+                    self._beat_ns = self._clock.now_ns()
                     camera.release()
                 if self._number > before:
                     backoff_s, failures = _BACKOFF_MIN_S, 0
@@ -162,6 +173,7 @@ class DeviceSource:
     def _grab_until_broken(self, camera: OpenCamera) -> None:
         failed, last_ns = 0, self._clock.now_ns()
         while not self._stop.is_set():
+            self._beat_ns = self._clock.now_ns()
             shot = camera.grab()
             if shot is None:
                 failed += 1

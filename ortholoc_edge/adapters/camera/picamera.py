@@ -85,6 +85,8 @@ class Picamera:
         try:
             request = self._device.capture_request(wait=_WAIT_S)
         except TimeoutError:
+            # The capture waits on at the head of Picamera2's list, and a stop behind it would wait for ever.
+            self._device.cancel_all_and_flush()
             return None
         arrival_ns = self._clock.now_ns()
         try:
