@@ -115,6 +115,26 @@ def test_a_camera_that_goes_silent_is_opened_again(
     frame_from(source)
 
 
+def test_what_a_stall_kept_back_is_not_stamped_as_new(
+    camera: RtspCamera, opened: Callable[..., DeviceSource], caplog: pytest.LogCaptureFixture
+) -> None:
+    """The backlog comes within some ten ms, each frame of it up to 2 s after it was taken."""
+    source = opened(f"rtsp://pilot:hunter2@127.0.0.1:{camera.port}/live")
+    frame_from(source)
+    camera.held.set()
+    time.sleep(2.0)
+    before = camera.sent
+    camera.held.clear()
+    number, ages_ms = 0, []
+    while number < before + 10:
+        frame = frame_from(source)
+        number = number_of(frame)
+        ages_ms.append((frame.stamp_ns - camera.taken_ns[number]) / MS)
+    assert max(ages_ms) < 150.0 and not source.reconnects
+    assert source.counts()["left_out"] > 40
+    assert caplog.text.count("later than others; such frames are left out") == 1
+
+
 def test_a_wrong_password_and_who_never_answers(
     camera: RtspCamera,
     opened: Callable[..., DeviceSource],

@@ -8,9 +8,10 @@ import os
 
 import cv2
 
-from ortholoc_edge.adapters.camera.live import Shot
+from ortholoc_edge.adapters.camera.live import Late, Shot
 from ortholoc_edge.adapters.camera.options import CameraOptions
 from ortholoc_edge.adapters.camera.pictures import rgb
+from ortholoc_edge.adapters.camera.stamps import Arrivals
 from ortholoc_edge.adapters.secret import without_credentials
 from ortholoc_edge.clock import Clock
 
@@ -28,24 +29,33 @@ _LOW_LATENCY = "rtsp_transport;tcp|fflags;nobuffer|flags;low_delay"
 class StreamCamera:
     """See `OpenCamera`."""
 
-    def __init__(self, name: str, capture: cv2.VideoCapture, options: CameraOptions, clock: Clock) -> None:
+    def __init__(
+        self, name: str, capture: cv2.VideoCapture, options: CameraOptions, clock: Clock, is_timed: bool
+    ) -> None:
         """
         Args:
             name: for messages.
             capture: open.
+            is_timed: frames come with the camera's time.
         """
         self._name, self._capture, self._clock = name, capture, clock
         self._latency_ns = round(options.latency_ms * _MS)
+        self._is_timed, self._arrivals = is_timed, Arrivals()
         # What it was set to where it stands.
         fixed = isinstance(options.exposure_ms, float | int)
         self._exposure_ns = round(float(options.exposure_ms) * _MS) if fixed else None  # type: ignore[arg-type]
 
-    def grab(self) -> Shot | None:
+    def grab(self) -> Shot | Late | None:
         """See `OpenCamera.grab`."""
         if not self._capture.grab():
             return None
-        # At once: decoding takes its time and is no part of the delay that the options state.
-        stamp_ns = self._clock.now_ns() - self._latency_ns
+        # Decoded by then, which is part of the delay that the options state; conversion to RGB, which follows, is not.
+        arrival_ns = self._clock.now_ns()
+        own_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * _MS) if self._is_timed else None
+        late_ns = self._arrivals.late_ns(own_ns, arrival_ns)
+        if late_ns is not None:
+            return Late(late_ns)
+        stamp_ns = arrival_ns - self._latency_ns
         good, image = self._capture.retrieve()
         if not good or image is None:
             return None
@@ -83,4 +93,6 @@ def open_network(address: str, options: CameraOptions, clock: Clock) -> StreamCa
         return None
     name = shown_address(address)
     logger.info("camera %s open", name)
-    return StreamCamera(name, capture, options, clock)
+    # Pictures over HTTP have no time of their own: FFmpeg counts them as if there were 25 a second.
+    is_timed = address.startswith("rtsp:") or capture.get(cv2.CAP_PROP_FOURCC) != cv2.VideoWriter.fourcc(*"MJPG")
+    return StreamCamera(name, capture, options, clock, is_timed)
