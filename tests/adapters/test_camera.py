@@ -405,6 +405,14 @@ def test_options_choose_the_source(folder, video):
     assert isinstance(open_source(CameraOptions(source=f"video:{video}"), clock), VideoSource)
 
 
+def test_a_source_in_its_parts():
+    stream = CameraOptions(source="rtsp://10.0.0.2:554/live", exposure_ms=4)
+    assert (stream.kind, stream.place, stream.is_live) == ("rtsp", "//10.0.0.2:554/live", True)
+    assert stream.fixed_exposure_ns == 4 * MS, "also where it is an integer"
+    assert CameraOptions(source="device:0", exposure_ms="auto").fixed_exposure_ns is None
+    assert not CameraOptions(source="video:a.mp4").is_live
+
+
 @pytest.mark.parametrize("text", ["", "folder:", "webcam", "rtsp:host", "ftp://host/a.mjpg", "/dev/video0"])
 def test_unknown_source_is_a_config_error(text):
     with pytest.raises(ConfigError, match="can't be used; write folder:PATH"):

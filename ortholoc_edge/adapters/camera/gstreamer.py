@@ -20,7 +20,7 @@ from ortholoc_edge.geometry.arrays import ImageArray
 
 logger = logging.getLogger(__name__)
 
-_MS, _S = 1_000_000, 1_000_000_000
+_S = 1_000_000_000
 _START_NS, _PULL_NS = 5 * _S, 2 * _S
 _PROPERTY = re.compile(r"([\w-]+)\s*=\s*(\S+)")
 # An appsink of its own accord queues without end, and holds each frame until it is time to show it.
@@ -83,9 +83,8 @@ class GstreamerCamera:
         self._video: Any = importlib.import_module("gi.repository.GstVideo")
         self._gst, self._pipeline, self._sink, self._options, self._clock = gst, pipeline, sink, options, clock
         self._stamper, self._arrivals = Stamper("gstreamer", options), Arrivals()
-        wanted = options.exposure_ms
         # What the pipeline sets it to.
-        self._exposure_ns = round(wanted * _MS) if isinstance(wanted, float | int) else None
+        self._exposure_ns = options.fixed_exposure_ns
 
     @staticmethod
     def open(pipeline: str, options: CameraOptions, clock: Clock) -> GstreamerCamera | None:

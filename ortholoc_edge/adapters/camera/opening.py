@@ -28,7 +28,7 @@ def open_source(options: CameraOptions, clock: Clock, bus: Bus | None = None) ->
     Raises: ConfigError if the text can't be understood; CameraError if a folder or video can't be read, or a library
         is missing. A live camera that is missing is waited for instead.
     """
-    kind, _, rest = options.source.partition(":")
+    kind, rest = options.kind, options.place
     if kind == "folder" and rest:
         return FolderSource(Path(rest), options.rate_hz, clock)
     if kind == "video" and rest:
@@ -37,12 +37,13 @@ def open_source(options: CameraOptions, clock: Clock, bus: Bus | None = None) ->
         if bus is None:
             raise ConfigError(f"camera source {options.source!r} comes over the bus; set [bus] enabled = true")
         return ZenohFrames(bus, rest, options, clock)
-    name, opened = _live(kind, rest, options, clock)
+    name, opened = _live(options, clock)
     return DeviceSource(name, opened, clock)
 
 
-def _live(kind: str, rest: str, options: CameraOptions, clock: Clock) -> tuple[str, Callable[[], OpenCamera | None]]:
+def _live(options: CameraOptions, clock: Clock) -> tuple[str, Callable[[], OpenCamera | None]]:
     """The name, and what opens it."""
+    kind, rest = options.kind, options.place
     if kind == "device" and rest:
         path = device_path(rest)
         prepare()

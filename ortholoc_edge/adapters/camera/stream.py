@@ -42,8 +42,7 @@ class StreamCamera:
         self._latency_ns = round(options.latency_ms * _MS)
         self._is_timed, self._arrivals = is_timed, Arrivals()
         # What it was set to where it stands.
-        fixed = isinstance(options.exposure_ms, float | int)
-        self._exposure_ns = round(float(options.exposure_ms) * _MS) if fixed else None  # type: ignore[arg-type]
+        self._exposure_ns = options.fixed_exposure_ns
 
     def grab(self) -> Shot | Late | None:
         """See `OpenCamera.grab`."""
