@@ -44,6 +44,7 @@ def test_an_appsink_that_does_not_queue(pipeline: str, made: str) -> None:
     ("pipeline", "words"),
     [
         ("videotestsrc", "ends in 'videotestsrc'; it must end in"),
+        ("rtspsrc user-id=pilot user-pw=hunter2", r"ends in 'rtspsrc user-id=\(left out\) user-pw=\(left out\)'"),
         ("videotestsrc ! fakesink", "ends in 'fakesink'"),
         ("videotestsrc !", "ends in 'nothing'"),
         ("! appsink", "ends in 'appsink'"),

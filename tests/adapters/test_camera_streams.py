@@ -15,7 +15,7 @@ import pytest
 
 from adapters.rtsp_server import RtspCamera
 from ortholoc_edge.adapters.camera import CameraOptions, DeviceSource, open_source, stream
-from ortholoc_edge.adapters.camera.stream import shown_address
+from ortholoc_edge.adapters.secret import without_credentials
 from ortholoc_edge.clock import SystemClock
 from ortholoc_edge.config import read_config, without_secrets
 from ortholoc_edge.pipeline.frame import Frame
@@ -179,15 +179,26 @@ def test_what_the_user_told_ffmpeg_stays(monkeypatch: pytest.MonkeyPatch) -> Non
         ("rtsp://host/live", "rtsp://host/live"),
         ("rtsp://a:b@host:554/live", "rtsp://(left out)@host:554/live"),
         ("rtsp://a:b@c@host/live", "rtsp://(left out)@host/live"),
-        ("http://host/cam?usr=a&pwd=b", "http://host/cam?…"),
+        ("http://host/cam?usr=a&pwd=b", "http://host/cam?(left out)"),
+        (
+            'gstreamer:souphttpsrc location="http://a:b@host/cam?usr=a&pwd=b" user-pw=\'b c\' ! appsink',
+            'gstreamer:souphttpsrc location="http://(left out)@host/cam?(left out)" user-pw=(left out) ! appsink',
+        ),
     ],
 )
 def test_addresses_are_shown_without_credentials(address: str, shown: str) -> None:
-    assert shown_address(address) == shown
+    assert without_credentials(address) == shown
 
 
-def test_a_password_with_an_at_sign_is_left_out_of_the_configuration() -> None:
+@pytest.mark.parametrize(
+    ("source", "shown"),
+    [
+        ("rtsp://pilot:hun@ter2@10.0.0.2/live", "rtsp://(left out)@10.0.0.2/live"),
+        ("http://10.0.0.2/mjpg?user=admin&pwd=hunter2", "http://10.0.0.2/mjpg?(left out)"),
+    ],
+)
+def test_what_the_bus_and_logs_tell_of_the_configuration_has_no_password(source: str, shown: str) -> None:
     config = read_config(CONFIG)
-    camera = msgspec.structs.replace(config.camera, source="rtsp://pilot:hun@ter2@10.0.0.2/live")
+    camera = msgspec.structs.replace(config.camera, source=source)
     told = without_secrets(msgspec.structs.replace(config, camera=camera))
-    assert told["camera"]["source"] == "rtsp://(left out)@10.0.0.2/live"
+    assert told["camera"]["source"] == shown

@@ -14,6 +14,7 @@ from ortholoc_edge.adapters.camera.live import Late, Shot
 from ortholoc_edge.adapters.camera.options import CameraOptions
 from ortholoc_edge.adapters.camera.pictures import frozen_rgb
 from ortholoc_edge.adapters.camera.stamps import Arrivals, Stamper
+from ortholoc_edge.adapters.secret import without_credentials
 from ortholoc_edge.clock import Clock
 from ortholoc_edge.errors import CameraError, ConfigError
 from ortholoc_edge.geometry.arrays import ImageArray
@@ -35,9 +36,8 @@ def low_latency(pipeline: str) -> str:
     """
     head, mark, sink = pipeline.rpartition("!")
     if not mark or not head.strip() or not sink.split() or sink.split()[0] != "appsink":
-        raise ConfigError(
-            f"camera source gstreamer: the pipeline ends in {sink.strip() or 'nothing'!r}; it must end in '! appsink'"
-        )
+        ends = without_credentials(sink.strip()) or "nothing"
+        raise ConfigError(f"camera source gstreamer: the pipeline ends in {ends!r}; it must end in '! appsink'")
     given = dict(_PROPERTY.findall(sink))
     for name, values in (("drop", ("true", "1")), ("max-buffers", ("1", "2"))):
         if name in given and given[name].lower() not in values:
@@ -96,7 +96,8 @@ class GstreamerCamera:
         try:
             made = gst.parse_launch(pipeline)
         except Exception as error:  # GLib.Error, which is not there before the bindings are
-            raise CameraError(f"camera source gstreamer: {error}; try it with gst-launch-1.0") from error
+            why = without_credentials(str(error))
+            raise CameraError(f"camera source gstreamer: {why}; try it with gst-launch-1.0") from error
         camera = GstreamerCamera(gst, made, _appsink(gst, made), options, clock)
         made.set_state(gst.State.PLAYING)
         result, _, _ = made.get_state(_START_NS)
@@ -160,7 +161,8 @@ class GstreamerCamera:
         while (message := bus.pop()) is not None:
             if message.type == self._gst.MessageType.ERROR:
                 error, _ = message.parse_error()
-                logger.warning("camera gstreamer: %s: %s", message.src.get_name(), error.message)
+                why = without_credentials(error.message)
+                logger.warning("camera gstreamer: %s: %s", message.src.get_name(), why)
 
     def release(self) -> None:
         """See `OpenCamera.release`."""

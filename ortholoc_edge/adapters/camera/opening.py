@@ -10,9 +10,10 @@ from ortholoc_edge.adapters.camera.files import FolderSource, VideoSource
 from ortholoc_edge.adapters.camera.live import DeviceSource, OpenCamera
 from ortholoc_edge.adapters.camera.options import CameraOptions
 from ortholoc_edge.adapters.camera.source import FrameSource
-from ortholoc_edge.adapters.camera.stream import open_network, prepare_network, shown_address
+from ortholoc_edge.adapters.camera.stream import open_network, prepare_network
 from ortholoc_edge.adapters.camera.v4l2 import V4l2Camera, device_path, prepare
 from ortholoc_edge.adapters.camera.zenoh_frames import ZenohFrames
+from ortholoc_edge.adapters.secret import without_credentials
 from ortholoc_edge.clock import Clock
 from ortholoc_edge.errors import ConfigError
 
@@ -50,7 +51,7 @@ def _live(options: CameraOptions, clock: Clock) -> tuple[str, Callable[[], OpenC
         return path, lambda: V4l2Camera.open(path, options, clock)
     if kind in ("rtsp", "http", "https") and rest.startswith("//"):
         prepare_network()
-        return shown_address(options.source), lambda: open_network(options.source, options, clock)
+        return without_credentials(options.source), lambda: open_network(options.source, options, clock)
     if kind == "gstreamer" and rest:
         # Not at the top: the bindings come with the system, and few have them.
         from ortholoc_edge.adapters.camera.gstreamer import GstreamerCamera, load, low_latency
@@ -66,6 +67,6 @@ def _live(options: CameraOptions, clock: Clock) -> tuple[str, Callable[[], OpenC
         number = int(rest or "0")
         return f"picamera2:{number}", lambda: Picamera.open(number, options, clock)
     raise ConfigError(
-        f"camera source {shown_address(options.source)!r} can't be used; write folder:PATH, video:PATH, "
+        f"camera source {without_credentials(options.source)!r} can't be used; write folder:PATH, video:PATH, "
         "device:/dev/video0, picamera2:0, rtsp://..., http://..., gstreamer:PIPELINE or zenoh:KEY"
     )

@@ -65,12 +65,6 @@ class StreamCamera:
         self._capture.release()
 
 
-def shown_address(address: str) -> str:
-    """An address for messages: without name, password and what stands behind a question mark, which may be one too."""
-    before, mark, _ = without_credentials(address).partition("?")
-    return f"{before}?…" if mark else before
-
-
 def prepare_network() -> None:
     """What FFmpeg has to know before it opens a stream; before there are threads. What the user has set stays."""
     os.environ.setdefault(_FFMPEG_OPTIONS, _LOW_LATENCY)
@@ -90,7 +84,7 @@ def open_network(address: str, options: CameraOptions, clock: Clock) -> StreamCa
     if not capture.isOpened():
         capture.release()
         return None
-    name = shown_address(address)
+    name = without_credentials(address)
     logger.info("camera %s open", name)
     # Pictures over HTTP have no time of their own: FFmpeg counts them as if there were 25 a second.
     is_timed = address.startswith("rtsp:") or capture.get(cv2.CAP_PROP_FOURCC) != cv2.VideoWriter.fourcc(*"MJPG")
