@@ -21,6 +21,7 @@ import numpy as np
 
 from ortholoc_edge.adapters.bus import bus_of
 from ortholoc_edge.adapters.camera import BadFrameError, EndOfFrames, FrameSource, open_source
+from ortholoc_edge.adapters.camera.stream import NETWORK
 from ortholoc_edge.adapters.camera.v4l2 import Settings, device_path, differences, read_settings
 from ortholoc_edge.adapters.computer import ComputerReader, ComputerStatus
 from ortholoc_edge.adapters.mavlink.audit import Finding, Level
@@ -50,8 +51,6 @@ _FRAMES_WANTED = 20
 _LEAST_RATE = 0.7
 # A frame that is older when it comes is old before anything is done with it.
 _OLD_MS = 150.0
-# Where frames are stamped on arrival.
-_STREAMS = ("rtsp", "http", "https")
 # Which are asked for one.
 _ASKED_FOR_RATE = ("device", "picamera2")
 
@@ -483,7 +482,7 @@ def check_look(config: Config, seen: Look) -> list[Finding]:
 
 def _check_time(config: Config, seen: Look) -> list[Finding]:
     """Stamps are of the exposure, and not long ago."""
-    if config.camera.kind in _STREAMS and config.camera.latency_ms == 0:
+    if config.camera.kind in NETWORK and config.camera.latency_ms == 0:
         return [
             Finding(
                 Level.WARNING, "camera", "latency_ms = 0 of a stream", "what it is late by",

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from adapters.rtsp_server import RtspCamera
-from ortholoc_edge.adapters.camera import CameraOptions, DeviceSource, open_source, stream
+from ortholoc_edge.adapters.camera import CameraOptions, DeviceSource, open_source, prepare, stream
 from ortholoc_edge.adapters.secret import without_credentials
 from ortholoc_edge.clock import SystemClock
 from ortholoc_edge.config import read_config, without_secrets
@@ -41,12 +41,17 @@ def number_of(frame: Frame) -> int:
 
 
 @pytest.fixture
-def opened() -> Iterator[Callable[..., DeviceSource]]:
+def opened(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., DeviceSource]]:
     """Opens sources, and closes them."""
     sources: list[DeviceSource] = []
+    # Put back after the test: FFmpeg reads files by it, too.
+    monkeypatch.setenv("OPENCV_FFMPEG_CAPTURE_OPTIONS", "")
+    monkeypatch.delenv("OPENCV_FFMPEG_CAPTURE_OPTIONS")
 
-    def make(address: str, **options: float) -> DeviceSource:
-        source = open_source(CameraOptions(source=address, **options), SystemClock())
+    def make(address: str, **given: float) -> DeviceSource:
+        options = CameraOptions(source=address, **given)
+        prepare(options)
+        source = open_source(options, SystemClock())
         assert isinstance(source, DeviceSource)
         sources.append(source)
         return source
@@ -164,11 +169,14 @@ def test_a_wrong_password_and_who_never_answers(
 
 
 def test_what_the_user_told_ffmpeg_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    live = CameraOptions(source="rtsp://10.0.0.2/live")
     monkeypatch.setenv("OPENCV_FFMPEG_CAPTURE_OPTIONS", "rtsp_transport;udp")
-    stream.prepare_network()
+    prepare(live)
     assert os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] == "rtsp_transport;udp"
     monkeypatch.delenv("OPENCV_FFMPEG_CAPTURE_OPTIONS")
-    stream.prepare_network()
+    prepare(CameraOptions(source="video:flight.mp4"))
+    assert "OPENCV_FFMPEG_CAPTURE_OPTIONS" not in os.environ, "a file's first frames would be lost"
+    prepare(live)
     assert "nobuffer" in os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"]
     assert "rtsp_transport;tcp" in os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"]
 

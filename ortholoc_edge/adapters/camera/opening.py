@@ -10,8 +10,8 @@ from ortholoc_edge.adapters.camera.files import FolderSource, VideoSource
 from ortholoc_edge.adapters.camera.live import DeviceSource, OpenCamera
 from ortholoc_edge.adapters.camera.options import CameraOptions
 from ortholoc_edge.adapters.camera.source import FrameSource
-from ortholoc_edge.adapters.camera.stream import open_network, prepare_network
-from ortholoc_edge.adapters.camera.v4l2 import V4l2Camera, device_path, prepare
+from ortholoc_edge.adapters.camera.stream import NETWORK, open_network, prepare_network
+from ortholoc_edge.adapters.camera.v4l2 import V4l2Camera, device_path, prepare_devices
 from ortholoc_edge.adapters.camera.zenoh_frames import ZenohFrames
 from ortholoc_edge.adapters.secret import without_credentials
 from ortholoc_edge.clock import Clock
@@ -19,6 +19,16 @@ from ortholoc_edge.errors import ConfigError
 
 if TYPE_CHECKING:
     from ortholoc_edge.adapters.bus import Bus
+
+
+def prepare(options: CameraOptions) -> None:
+    """Tell OpenCV, by the environment, what it takes from there alone. Before there are threads: while one sets a
+    variable another may not read one, and libraries do at any time. Without it sources work, with longer waits.
+    """
+    if options.kind == "device":
+        prepare_devices()
+    elif options.kind in NETWORK:
+        prepare_network()
 
 
 def open_source(options: CameraOptions, clock: Clock, bus: Bus | None = None) -> FrameSource:
@@ -47,10 +57,8 @@ def _live(options: CameraOptions, clock: Clock) -> tuple[str, Callable[[], OpenC
     kind, rest = options.kind, options.place
     if kind == "device" and rest:
         path = device_path(rest)
-        prepare()
         return path, lambda: V4l2Camera.open(path, options, clock)
-    if kind in ("rtsp", "http", "https") and rest.startswith("//"):
-        prepare_network()
+    if kind in NETWORK and rest.startswith("//"):
         return without_credentials(options.source), lambda: open_network(options.source, options, clock)
     if kind == "gstreamer" and rest:
         # Not at the top: the bindings come with the system, and few have them.

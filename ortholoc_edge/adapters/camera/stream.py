@@ -18,6 +18,8 @@ from ortholoc_edge.clock import Clock
 logger = logging.getLogger(__name__)
 
 _MS = 1_000_000
+# Kinds of sources that are addresses.
+NETWORK = ("rtsp", "http", "https")
 # FFmpeg's own are 30 s, in which a vehicle flies far.
 _OPEN_TIMEOUT_MS, _READ_TIMEOUT_MS = 5000, 3000
 # OpenCV takes FFmpeg's options from the environment alone, each time it opens a stream.
@@ -66,7 +68,7 @@ class StreamCamera:
 
 
 def prepare_network() -> None:
-    """What FFmpeg has to know before it opens a stream; before there are threads. What the user has set stays."""
+    """What FFmpeg has to know before it opens a stream; see `opening.prepare`. What the user has set stays."""
     os.environ.setdefault(_FFMPEG_OPTIONS, _LOW_LATENCY)
 
 
