@@ -502,7 +502,7 @@ def make_navigator(
     """Localizer and tracker as configured; the caller closes the localizer."""
     fixed = config.mount.body_from_camera() if config.mount.gimbal_selection() is None else None
     # A folder may hold a picture twice, and a video that was made for another rate does.
-    alive = not config.camera.source.startswith(("folder:", "video:"))
+    alive = config.camera.is_live
     return Navigator(
         Localizer(config.intrinsics.camera(), store, matcher, config.localizer, ladder),
         Tracker(store.pack.georeference, fixed, config.tracker, first_reset_counter, config.witness),

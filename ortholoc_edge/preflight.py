@@ -21,6 +21,7 @@ import numpy as np
 
 from ortholoc_edge.adapters.bus import bus_of
 from ortholoc_edge.adapters.camera import BadFrameError, EndOfFrames, FrameSource, open_source
+from ortholoc_edge.adapters.camera.stream import NETWORK
 from ortholoc_edge.adapters.camera.v4l2 import Settings, device_path, differences, read_settings
 from ortholoc_edge.adapters.computer import ComputerReader, ComputerStatus
 from ortholoc_edge.adapters.mavlink.audit import Finding, Level
@@ -50,10 +51,8 @@ _FRAMES_WANTED = 20
 _LEAST_RATE = 0.7
 # A frame that is older when it comes is old before anything is done with it.
 _OLD_MS = 150.0
-# Where frames are stamped on arrival.
-_STREAMS = ("rtsp", "http", "https")
-# Of 255 (field notes: darkness).
-_DARK = 12.0
+# Which are asked for one.
+_ASKED_FOR_RATE = ("device", "picamera2")
 
 
 def check_computer(config: Config, clock: Clock, environ: Mapping[str, str]) -> list[Finding]:
@@ -67,7 +66,7 @@ def check_computer(config: Config, clock: Clock, environ: Mapping[str, str]) -> 
 
             def opened() -> FrameSource:
                 bus = None
-                if config.camera.source.startswith("zenoh:") and config.bus.enabled:
+                if config.camera.kind == "zenoh" and config.bus.enabled:
                     bus = bus_of(config.bus, config.camera.source, environ)
                     closed_last.callback(bus.close)
                 return open_source(config.camera, clock, bus)
@@ -154,9 +153,8 @@ def check_devices(config: Config, may: Callable[[Path, int], bool]) -> list[Find
 
 def _devices(config: Config) -> list[tuple[str, Path]]:
     devices = []
-    kind, _, rest = config.camera.source.partition(":")
-    if kind == "device":
-        devices.append(("camera", Path(device_path(rest))))
+    if config.camera.kind == "device":
+        devices.append(("camera", Path(device_path(config.camera.place))))
     endpoint = parse_endpoint(config.link.endpoint)
     if endpoint.kind == "serial":
         devices.append(("link", Path(endpoint.address)))
@@ -367,8 +365,8 @@ class Look:
 
 
 def _settings_of(config: Config) -> Callable[[], Settings | None]:
-    kind, _, rest = config.camera.source.partition(":")
-    return (lambda: read_settings(device_path(rest))) if kind == "device" else lambda: None
+    camera = config.camera
+    return (lambda: read_settings(device_path(camera.place))) if camera.kind == "device" else lambda: None
 
 
 def look(
@@ -430,7 +428,7 @@ def check_look(config: Config, seen: Look) -> list[Finding]:
         return [
             Finding(
                 Level.ERROR, "camera", f"no frame in {_LOOK_S:g} s", "frames", why,
-                f"look at the source with another program; it is {config.camera.source.partition(':')[0]}",
+                f"look at the source with another program; it is {config.camera.kind}",
             )
         ]  # fmt: skip
     found = []
@@ -445,8 +443,7 @@ def check_look(config: Config, seen: Look) -> list[Finding]:
             )
         )  # fmt: skip
     asked_hz = config.camera.fps or config.camera.rate_hz
-    is_device = config.camera.source.startswith("device:")
-    if is_device and seen.rate_hz is not None and seen.rate_hz < _LEAST_RATE * asked_hz:
+    if config.camera.kind in _ASKED_FOR_RATE and seen.rate_hz is not None and seen.rate_hz < _LEAST_RATE * asked_hz:
         found.append(
             Finding(
                 Level.WARNING, "camera", f"{seen.rate_hz:.1f} frames per second", f"{asked_hz:g}",
@@ -454,18 +451,22 @@ def check_look(config: Config, seen: Look) -> list[Finding]:
                 "more light or a fixed exposure; MJPG in place of YUYV; or ask for what it can give",
             )
         )  # fmt: skip
-    if max(seen.brightness) < _DARK:
+    darkest = config.picture.min_brightness
+    is_dark = max(seen.brightness) < darkest
+    if is_dark:
         found.append(
             Finding(
-                Level.WARNING, "camera", f"brightness {max(seen.brightness):.0f} of 255", f"above {_DARK:.0f}",
+                Level.WARNING, "camera", f"brightness {max(seen.brightness):.0f} of 255", f"above {darkest:g}",
                 "nothing can be matched in the dark", "take the lens cap off; by night there are no fixes",
             )
         )  # fmt: skip
-    if is_device and len(seen.sizes) > 2 and seen.alike == len(seen.sizes) - 1:
+    # Pictures without light are alike, too.
+    if config.camera.is_live and not is_dark and len(seen.sizes) > 2 and seen.alike == len(seen.sizes) - 1:
         found.append(
             Finding(
                 Level.ERROR, "camera", "the same picture again and again", "frames that differ",
-                "sensors have noise, so it is frozen", "unplug it and plug it in again; change its driver or cable",
+                "sensors have noise, so it is frozen",
+                "unplug it and plug it in again; change its driver, its cable, or what serves the stream",
             )
         )  # fmt: skip
     found += [*_check_time(config, seen), *_check_settings(config, seen)]
@@ -481,8 +482,7 @@ def check_look(config: Config, seen: Look) -> list[Finding]:
 
 def _check_time(config: Config, seen: Look) -> list[Finding]:
     """Stamps are of the exposure, and not long ago."""
-    kind = config.camera.source.partition(":")[0]
-    if kind in _STREAMS and config.camera.latency_ms == 0:
+    if config.camera.kind in NETWORK and config.camera.latency_ms == 0:
         return [
             Finding(
                 Level.WARNING, "camera", "latency_ms = 0 of a stream", "what it is late by",
@@ -490,7 +490,7 @@ def _check_time(config: Config, seen: Look) -> list[Finding]:
                 "measure it (docs/cameras.md) and write it into [camera] latency_ms",
             )
         ]  # fmt: skip
-    if kind not in ("folder", "video") and seen.age_ms is not None and seen.age_ms > _OLD_MS:
+    if config.camera.is_live and seen.age_ms is not None and seen.age_ms > _OLD_MS:
         return [
             Finding(
                 Level.WARNING, "camera", f"frames are {seen.age_ms:.0f} ms old when they come", f"{_OLD_MS:.0f} ms",

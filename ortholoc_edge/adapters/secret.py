@@ -13,13 +13,17 @@ LEFT_OUT = "(left out)"
 # rtsp://NAME:PASSWORD@HOST, and properties of GStreamer's sources. A password may hold an @, and no / unless escaped.
 _IN_ADDRESS = re.compile(r"(://)[^/\s]+@")
 _AS_PROPERTY = re.compile(
-    r'\b(user-id|user-pw|proxy-id|proxy-pw|password|passwd|token|secret)(\s*=\s*)("[^"]*"|\S+)'
+    r"""\b(user-id|user-pw|proxy-id|proxy-pw|password|passwd|token|secret)(\s*=\s*)("[^"]*"|'[^']*'|\S+)"""
 )
+# Cameras take ?user=NAME&pwd=PASSWORD under names of their own, so nothing of a query is shown.
+_IN_QUERY = re.compile(rf"""(://(?:{re.escape(LEFT_OUT)}@)?[^\s?"']*\?)[^\s"']+""")
 
 
 def without_credentials(text: str) -> str:
     """An address or a GStreamer pipeline, for others to read."""
-    return _AS_PROPERTY.sub(rf"\1\2{LEFT_OUT}", _IN_ADDRESS.sub(rf"\1{LEFT_OUT}@", text))
+    return _AS_PROPERTY.sub(
+        rf"\1\2{LEFT_OUT}", _IN_QUERY.sub(rf"\1{LEFT_OUT}", _IN_ADDRESS.sub(rf"\1{LEFT_OUT}@", text))
+    )
 
 
 def read_secret(name: str, environ: Mapping[str, str], key: str) -> tuple[Path, bytes]:

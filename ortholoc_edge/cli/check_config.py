@@ -47,6 +47,12 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps(without_secrets(config), indent=2))
     else:
+        if idle := config.camera.idle_keys():
+            print(
+                f"{args.file}: [camera] {', '.join(idle)}: {config.camera.kind} has no use for "
+                f"{'it' if len(idle) == 1 else 'them'}, so nothing is set by {'it' if len(idle) == 1 else 'them'}; "
+                "set it where the frames come from (docs/cameras.md), and leave it out here"
+            )
         given = sum(1 for _ in _leaves(msgspec.to_builtins(config)))
         print(f"{args.file}: can be flown with; {given} values in force, see them with --json")
         if config.intrinsics.file is not None:

@@ -128,8 +128,10 @@ def run(args: argparse.Namespace) -> int:
 
 def _computer(config: Config, *, as_json: bool) -> int:
     # Not at the top: it opens maps and cameras, which the rest does not need.
+    from ortholoc_edge.adapters.camera import prepare
     from ortholoc_edge.preflight import check_computer
 
+    prepare(config.camera)
     findings = check_computer(config, SystemClock(), os.environ)
     if as_json:
         print(json.dumps({"findings": [asdict(finding) for finding in findings]}, indent=2))

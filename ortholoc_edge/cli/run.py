@@ -11,6 +11,7 @@ import sys
 import threading
 from pathlib import Path
 
+from ortholoc_edge.adapters.camera import prepare
 from ortholoc_edge.adapters.mavlink.link import SWITCH_INTERVAL_S
 from ortholoc_edge.cli.logs import from_a_thread_of_its_own
 from ortholoc_edge.config import Config, read_config
@@ -47,6 +48,7 @@ def run(args: argparse.Namespace) -> int:
 
     config = read_config(args.config)
     set_level(config)
+    prepare(config.camera)
     daemon = Daemon(config)
     stop = threading.Event()
     reloader = Reloader(config, lambda: read_config(args.config), take_over)

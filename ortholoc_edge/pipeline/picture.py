@@ -82,6 +82,13 @@ def unfit(frame: Frame, seen: Seen, smear_px: float | None, options: PictureOpti
     Args:
         smear_px: predicted; None where it can't be.
     """
+    # First: under a lens cap pictures are alike, and nothing is wrong with the camera.
+    if seen.rows is not None:
+        brightness = float(cv2.mean(seen.rows)[0])
+        if brightness < options.min_brightness:
+            return Rejected(
+                frame.stamp_ns, Reason.DARK, "mean grey value, of 255", brightness, options.min_brightness
+            )
     if options.refuse_repeated and seen.repeats >= options.frozen_after:
         return Rejected(
             frame.stamp_ns, Reason.FROZEN, "frames with one and the same picture; unplug the camera and plug it in",
@@ -91,12 +98,6 @@ def unfit(frame: Frame, seen: Seen, smear_px: float | None, options: PictureOpti
         return Rejected(
             frame.stamp_ns, Reason.REPEATED, "the very picture of the frame before, so the stamp is not its own"
         )
-    if seen.rows is not None:
-        brightness = float(cv2.mean(seen.rows)[0])
-        if brightness < options.min_brightness:
-            return Rejected(
-                frame.stamp_ns, Reason.DARK, "mean grey value, of 255", brightness, options.min_brightness
-            )
     if smear_px is not None and smear_px > options.max_blur_px:
         assert frame.exposure_ns is not None
         return Rejected(

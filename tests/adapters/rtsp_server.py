@@ -9,6 +9,7 @@ import socket
 import socketserver
 import struct
 import threading
+import time
 from collections.abc import Callable
 
 import cv2
@@ -25,6 +26,8 @@ class RtspCamera:
         port: chosen by the system unless given.
         sent: frames so far, to all.
         silent: while set no frame is sent, and connections stay.
+        held: while set frames are taken but kept, and then sent all at once, as TCP does after a stall.
+        taken_ns: when each picture was, monotonic clock.
         refused: how many requests came without the right name and password.
     """
 
@@ -50,6 +53,8 @@ class RtspCamera:
         self._stop = threading.Event()
         self._connections: set[socket.socket] = set()
         self.silent = threading.Event()
+        self.held = threading.Event()
+        self.taken_ns: list[int] = []
         self.sent = 0
         self.refused = 0
         self._server = Server(("127.0.0.1", port), Handler)
@@ -116,18 +121,23 @@ class RtspCamera:
     def _send(self, connection: socket.socket, lock: threading.Lock) -> None:
         sequence = 0
         number = 0
+        kept: list[bytes] = []
         with contextlib.suppress(OSError):
             while not self._stop.wait(self._period_s):
                 number += 1
                 if self.silent.is_set():
                     continue
-                for packet in rtp_packets(
+                self.taken_ns.append(time.monotonic_ns())
+                packets = rtp_packets(
                     self._picture(self.sent), sequence, round(number * self._period_s * _CLOCK_HZ)
-                ):
-                    sequence += 1
-                    with lock:
-                        connection.sendall(struct.pack(">cBH", b"$", 0, len(packet)) + packet)
+                )
+                sequence += len(packets)
+                kept += [struct.pack(">cBH", b"$", 0, len(packet)) + packet for packet in packets]
                 self.sent += 1
+                if not self.held.is_set():
+                    with lock:
+                        connection.sendall(b"".join(kept))
+                    kept.clear()
 
 
 def _read_request(lines: object) -> tuple[str, dict[str, str]]:

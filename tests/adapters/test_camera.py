@@ -357,6 +357,45 @@ def test_missing_device_is_waited_for(tmp_path, caplog):
     assert sum("can't be opened" in r.message for r in caplog.records) == 1
 
 
+class Stuck:
+    """A camera whose driver keeps the thread in one of its calls."""
+
+    def __init__(self, where: str) -> None:
+        self.where, self.entered, self.freed = where, threading.Event(), threading.Event()
+
+    def open(self):
+        self._pass("open")
+        return self
+
+    def grab(self):
+        self._pass("grab")
+
+    def release(self):
+        self._pass("release")
+
+    def _pass(self, where):
+        if where == self.where:
+            self.entered.set()
+            self.freed.wait(10.0)
+
+
+@pytest.mark.parametrize("where", ["open", "grab", "release"])
+def test_a_driver_that_never_comes_back_is_an_error(where):
+    """The thread can't be ended from outside, and waiting on would fly blind for good."""
+    clock, camera = ManualClock(), Stuck(where)
+    source = DeviceSource("stuck", camera.open, clock)
+    try:
+        assert camera.entered.wait(10.0)
+        clock.set_ns(15_000 * MS)
+        assert source.read(0.0) is None
+        clock.set_ns(25_000 * MS)
+        with pytest.raises(CameraError, match="camera stuck: its driver has not come back for 25 s; start"):
+            source.read(0.0)
+    finally:
+        camera.freed.set()
+        source.close()
+
+
 # -- options -------------------------------------------------------------------
 
 
@@ -364,6 +403,14 @@ def test_options_choose_the_source(folder, video):
     clock = ManualClock()
     assert isinstance(open_source(CameraOptions(source=f"folder:{folder}"), clock), FolderSource)
     assert isinstance(open_source(CameraOptions(source=f"video:{video}"), clock), VideoSource)
+
+
+def test_a_source_in_its_parts():
+    stream = CameraOptions(source="rtsp://10.0.0.2:554/live", exposure_ms=4)
+    assert (stream.kind, stream.place, stream.is_live) == ("rtsp", "//10.0.0.2:554/live", True)
+    assert stream.fixed_exposure_ns == 4 * MS, "also where it is an integer"
+    assert CameraOptions(source="device:0", exposure_ms="auto").fixed_exposure_ns is None
+    assert not CameraOptions(source="video:a.mp4").is_live
 
 
 @pytest.mark.parametrize("text", ["", "folder:", "webcam", "rtsp:host", "ftp://host/a.mjpg", "/dev/video0"])

@@ -44,6 +44,7 @@ def test_an_appsink_that_does_not_queue(pipeline: str, made: str) -> None:
     ("pipeline", "words"),
     [
         ("videotestsrc", "ends in 'videotestsrc'; it must end in"),
+        ("rtspsrc user-id=pilot user-pw=hunter2", r"ends in 'rtspsrc user-id=\(left out\) user-pw=\(left out\)'"),
         ("videotestsrc ! fakesink", "ends in 'fakesink'"),
         ("videotestsrc !", "ends in 'nothing'"),
         ("! appsink", "ends in 'appsink'"),
@@ -166,3 +167,109 @@ def test_no_pipeline_and_one_that_fails(
         time.sleep(0.02)
     assert "camera gstreamer: filesrc0: Resource not found" in caplog.text
     assert "can't be opened; trying again" in caplog.text
+
+
+# -- buffers of our own making -------------------------------------------------
+
+WIDTH, HEIGHT = 22, 6
+
+
+class Pushed:
+    """A pipeline whose buffers the test makes, stamped by arrival; the clock stands where it is told to."""
+
+    def __init__(self, form: str = "RGB") -> None:
+        from ortholoc_edge.adapters.camera.gstreamer import GstreamerCamera, load
+
+        self.gst: Any = load()
+        caps = f"video/x-raw,format={form},width={WIDTH},height={HEIGHT},framerate=0/1"
+        self.pipeline = self.gst.parse_launch(f"appsrc name=from format=time caps={caps} ! appsink name=to sync=false")
+        self.source = self.pipeline.get_by_name("from")
+        self.clock = ManualClock(10**12)
+        self.camera = GstreamerCamera(
+            self.gst, self.pipeline, self.pipeline.get_by_name("to"),
+            CameraOptions(source="gstreamer:x", stamps="arrival"), self.clock,
+        )  # fmt: skip
+        self.pipeline.set_state(self.gst.State.PLAYING)
+
+    def push(self, data: bytes, pts_ns: int = 0, begin: int = 0, stride: int = 0) -> Any:
+        """And what comes out of it. With a ``stride`` the buffer says how its rows lie."""
+        video: Any = importlib.import_module("gi.repository.GstVideo")
+        buffer = self.gst.Buffer.new_wrapped(data)
+        buffer.pts = pts_ns
+        if stride:
+            video.buffer_add_video_meta_full(
+                buffer, video.VideoFrameFlags.NONE, video.VideoFormat.RGB, WIDTH, HEIGHT, 1, [begin, 0, 0, 0],
+                [stride, 0, 0, 0],
+            )  # fmt: skip
+        self.source.push_buffer(buffer)
+        return self.camera.grab()
+
+    def shot_of(self, data: bytes, begin: int = 0, stride: int = 0) -> Any:
+        """Of the second frame: the first ones are left out until it is known how late frames are."""
+        self.push(data, 0, begin, stride)
+        self.clock.set_ns(self.clock.now_ns() + 1000 * MS)
+        return self.push(data, 1000 * MS, begin, stride)
+
+
+@pytest.fixture
+def pushed(bindings: None) -> Iterator[Callable[..., Pushed]]:
+    made: list[Pushed] = []
+
+    def make(form: str = "RGB") -> Pushed:
+        made.append(Pushed(form))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.camera.release()
+
+
+@pytest.mark.parametrize(
+    ("form", "begin", "stride", "more"),
+    [
+        ("RGB", 0, 0, 0),
+        # Longer than its rows: alignment of the allocator's, a hardware decoder's height in blocks of 16.
+        ("RGB", 0, 0, 300),
+        ("GRAY8", 0, 0, 100),
+        ("RGB", 0, 128, 64),
+        ("RGB", 40, 96, 1000),
+    ],
+)
+def test_rows_lie_as_the_buffer_says(
+    pushed: Callable[..., Pushed], form: str, begin: int, stride: int, more: int
+) -> None:
+    channels = 3 if form == "RGB" else 1
+    image = np.random.default_rng(3).integers(0, 255, (HEIGHT, WIDTH * channels), dtype=np.uint8)
+    lies = np.zeros((HEIGHT, stride or (WIDTH * channels + 3) // 4 * 4), np.uint8)
+    lies[:, : WIDTH * channels] = image
+    shot = pushed(form).shot_of(bytes(begin) + lies.tobytes() + bytes(more), begin, stride)
+    np.testing.assert_array_equal(shot.image.reshape(HEIGHT, -1), image)
+
+
+def test_a_buffer_that_is_too_short_is_an_error(pushed: Callable[..., Pushed]) -> None:
+    with pytest.raises(CameraError, match=r"a frame of 300 bytes, and 22 x 6 px at 68 bytes a row are 406"):
+        pushed().shot_of(bytes(300))
+
+
+def test_nobody_else_empties_the_bus(pushed: Callable[..., Pushed]) -> None:
+    one = pushed()
+    bus = one.pipeline.get_bus()
+    for _ in range(50):
+        bus.post(one.gst.Message.new_application(one.pipeline, one.gst.Structure.new_empty("told")))
+    one.push(bytes(68 * HEIGHT))
+    assert not bus.have_pending()
+
+
+def test_by_arrival_what_was_queued_is_left_out(pushed: Callable[..., Pushed]) -> None:
+    from ortholoc_edge.adapters.camera.live import Late
+
+    one, data = pushed(), bytes(68 * HEIGHT)
+    late = {}
+    for number in range(40):
+        pts_ns = number * 40 * MS
+        # From 800 to 1400 ms nothing arrives.
+        one.clock.set_ns(10**12 + (1400 * MS if 800 * MS <= pts_ns < 1400 * MS else pts_ns))
+        shot = one.push(data, pts_ns)
+        late[number] = shot.late_ns // MS if isinstance(shot, Late) else None
+    assert late[19] is None and late[20] == 600 - 2 and late[39] is None
+    assert all(late[number] is not None for number in range(20, 32))

@@ -49,6 +49,8 @@ class Device:
     absent = False
     age_ns = 30 * MS
     exposure_us = 4000
+    # Of every one: no frame comes.
+    silent = False
 
     def __init__(self, camera_num: int = 0) -> None:
         if self.absent:
@@ -59,8 +61,8 @@ class Device:
         self.camera_properties = {"Model": "imx296"}
         self.requests: list[Request] = []
         self.started = self.closed = False
-        self.silent = False
-        self.size = (640, 480)
+        # Jobs are done in their order, a capture when a frame comes.
+        self.captures_waiting = 0
 
     def create_video_configuration(self, main: dict[str, Any], controls: dict[str, Any]) -> dict[str, Any]:
         return {"main": {"size": (1280, 720), **main}, "controls": controls}
@@ -80,6 +82,7 @@ class Device:
     def capture_request(self, wait: float) -> Request:
         assert self.started and 0 < wait <= 5
         if self.silent:
+            self.captures_waiting += 1
             raise TimeoutError
         time.sleep(0.01)
         width, height = self.configuration["main"]["size"]
@@ -91,7 +94,12 @@ class Device:
         self.requests.append(Request(image, metadata))
         return self.requests[-1]
 
+    def cancel_all_and_flush(self) -> None:
+        self.captures_waiting = 0
+
     def stop(self) -> None:
+        if self.captures_waiting:
+            threading.Event().wait()
         self.started = False
 
     def close(self) -> None:
@@ -174,6 +182,20 @@ def test_a_camera_that_is_not_there_or_silent_is_waited_for(
     assert camera is not None
     device.made[-1].silent = True
     assert camera.grab() is None
+
+
+def test_a_camera_that_falls_silent_is_opened_again(
+    source: DeviceSource, device: type[Device], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its stop waits behind a capture that was given up, unless that is taken back."""
+    frame_from(source)
+    monkeypatch.setattr(Device, "silent", True)
+    end = time.monotonic() + 10.0
+    while not source.reconnects and time.monotonic() < end:
+        time.sleep(0.02)
+    assert source.reconnects and device.made[0].closed
+    monkeypatch.setattr(Device, "silent", False)
+    frame_from(source)
 
 
 def test_other_values_than_asked_for_are_said(

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from adapters.rtsp_server import RtspCamera
-from ortholoc_edge.adapters.camera import CameraOptions, DeviceSource, open_source, stream
-from ortholoc_edge.adapters.camera.stream import shown_address
+from ortholoc_edge.adapters.camera import CameraOptions, DeviceSource, open_source, prepare, stream
+from ortholoc_edge.adapters.secret import without_credentials
 from ortholoc_edge.clock import SystemClock
 from ortholoc_edge.config import read_config, without_secrets
 from ortholoc_edge.pipeline.frame import Frame
@@ -41,12 +41,17 @@ def number_of(frame: Frame) -> int:
 
 
 @pytest.fixture
-def opened() -> Iterator[Callable[..., DeviceSource]]:
+def opened(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., DeviceSource]]:
     """Opens sources, and closes them."""
     sources: list[DeviceSource] = []
+    # Put back after the test: FFmpeg reads files by it, too.
+    monkeypatch.setenv("OPENCV_FFMPEG_CAPTURE_OPTIONS", "")
+    monkeypatch.delenv("OPENCV_FFMPEG_CAPTURE_OPTIONS")
 
-    def make(address: str, **options: float) -> DeviceSource:
-        source = open_source(CameraOptions(source=address, **options), SystemClock())
+    def make(address: str, **given: float) -> DeviceSource:
+        options = CameraOptions(source=address, **given)
+        prepare(options)
+        source = open_source(options, SystemClock())
         assert isinstance(source, DeviceSource)
         sources.append(source)
         return source
@@ -115,6 +120,26 @@ def test_a_camera_that_goes_silent_is_opened_again(
     frame_from(source)
 
 
+def test_what_a_stall_kept_back_is_not_stamped_as_new(
+    camera: RtspCamera, opened: Callable[..., DeviceSource], caplog: pytest.LogCaptureFixture
+) -> None:
+    """The backlog comes within some ten ms, each frame of it up to 2 s after it was taken."""
+    source = opened(f"rtsp://pilot:hunter2@127.0.0.1:{camera.port}/live")
+    frame_from(source)
+    camera.held.set()
+    time.sleep(2.0)
+    before = camera.sent
+    camera.held.clear()
+    number, ages_ms = 0, []
+    while number < before + 10:
+        frame = frame_from(source)
+        number = number_of(frame)
+        ages_ms.append((frame.stamp_ns - camera.taken_ns[number]) / MS)
+    assert max(ages_ms) < 150.0 and not source.reconnects
+    assert source.counts()["left_out"] > 40
+    assert caplog.text.count("later than others; such frames are left out") == 1
+
+
 def test_a_wrong_password_and_who_never_answers(
     camera: RtspCamera,
     opened: Callable[..., DeviceSource],
@@ -144,11 +169,14 @@ def test_a_wrong_password_and_who_never_answers(
 
 
 def test_what_the_user_told_ffmpeg_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    live = CameraOptions(source="rtsp://10.0.0.2/live")
     monkeypatch.setenv("OPENCV_FFMPEG_CAPTURE_OPTIONS", "rtsp_transport;udp")
-    stream.prepare_network()
+    prepare(live)
     assert os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"] == "rtsp_transport;udp"
     monkeypatch.delenv("OPENCV_FFMPEG_CAPTURE_OPTIONS")
-    stream.prepare_network()
+    prepare(CameraOptions(source="video:flight.mp4"))
+    assert "OPENCV_FFMPEG_CAPTURE_OPTIONS" not in os.environ, "a file's first frames would be lost"
+    prepare(live)
     assert "nobuffer" in os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"]
     assert "rtsp_transport;tcp" in os.environ["OPENCV_FFMPEG_CAPTURE_OPTIONS"]
 
@@ -159,15 +187,26 @@ def test_what_the_user_told_ffmpeg_stays(monkeypatch: pytest.MonkeyPatch) -> Non
         ("rtsp://host/live", "rtsp://host/live"),
         ("rtsp://a:b@host:554/live", "rtsp://(left out)@host:554/live"),
         ("rtsp://a:b@c@host/live", "rtsp://(left out)@host/live"),
-        ("http://host/cam?usr=a&pwd=b", "http://host/cam?…"),
+        ("http://host/cam?usr=a&pwd=b", "http://host/cam?(left out)"),
+        (
+            'gstreamer:souphttpsrc location="http://a:b@host/cam?usr=a&pwd=b" user-pw=\'b c\' ! appsink',
+            'gstreamer:souphttpsrc location="http://(left out)@host/cam?(left out)" user-pw=(left out) ! appsink',
+        ),
     ],
 )
 def test_addresses_are_shown_without_credentials(address: str, shown: str) -> None:
-    assert shown_address(address) == shown
+    assert without_credentials(address) == shown
 
 
-def test_a_password_with_an_at_sign_is_left_out_of_the_configuration() -> None:
+@pytest.mark.parametrize(
+    ("source", "shown"),
+    [
+        ("rtsp://pilot:hun@ter2@10.0.0.2/live", "rtsp://(left out)@10.0.0.2/live"),
+        ("http://10.0.0.2/mjpg?user=admin&pwd=hunter2", "http://10.0.0.2/mjpg?(left out)"),
+    ],
+)
+def test_what_the_bus_and_logs_tell_of_the_configuration_has_no_password(source: str, shown: str) -> None:
     config = read_config(CONFIG)
-    camera = msgspec.structs.replace(config.camera, source="rtsp://pilot:hun@ter2@10.0.0.2/live")
+    camera = msgspec.structs.replace(config.camera, source=source)
     told = without_secrets(msgspec.structs.replace(config, camera=camera))
-    assert told["camera"]["source"] == "rtsp://(left out)@10.0.0.2/live"
+    assert told["camera"]["source"] == shown

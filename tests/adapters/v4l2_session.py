@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ortholoc_edge.adapters.camera import BadFrameError, CameraOptions, DeviceSource, open_source
+from ortholoc_edge.adapters.camera import BadFrameError, CameraOptions, DeviceSource, open_source, prepare
 from ortholoc_edge.adapters.camera.v4l2 import differences, read_settings
 from ortholoc_edge.clock import SystemClock
 from ortholoc_edge.pipeline.frame import Frame
@@ -81,6 +81,7 @@ def well(device: Path) -> dict[str, object]:
     options = CameraOptions(
         source=f"device:{device}", format="MJPG", width_px=WIDTH, height_px=HEIGHT, fps=25.0, exposure_ms=5.0, gain=30.0
     )
+    prepare(options)
     source = open_source(options, CLOCK)
     assert isinstance(source, DeviceSource)
     seen: dict[str, object] = {"first": told(until(source, is_frame))}
@@ -118,6 +119,7 @@ def otherwise(device: Path) -> dict[str, object]:
         source=f"device:{device}", format="NV12", width_px=1280, height_px=720, fps=60.0, exposure_ms=100.0,
         gain=500.0, latency_ms=40.0,
     )  # fmt: skip
+    prepare(options)
     source = open_source(options, CLOCK)
     assert isinstance(source, DeviceSource)
     seen: dict[str, object] = {"first": told(until(source, is_frame))}
@@ -140,6 +142,7 @@ def automatic(device: Path) -> dict[str, object]:
         source=f"device:{device}", format="YUYV", width_px=WIDTH, height_px=HEIGHT, fps=30.0, exposure_ms="auto",
         readout_ms=10.0,
     )  # fmt: skip
+    prepare(options)
     source = open_source(options, CLOCK)
     assert isinstance(source, DeviceSource)
     seen: dict[str, object] = {"first": told(until(source, is_frame))}

@@ -20,7 +20,8 @@ EXAMPLES = sorted((ROOT / "config").glob("*.toml"))
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_every_example_can_be_flown_with(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check-config", str(path)]) == 0
-    assert "can be flown with" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "can be flown with" in said and "has no use for" not in said
     assert path.name in (ROOT / "config" / "README.md").read_text(encoding="utf-8")
     assert main(["check-config", str(path), "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == json.loads(config_text(read_config(path)))
@@ -48,6 +49,30 @@ def test_a_wrong_key_is_named_with_the_valid_ones(
     path.write_text(base + text, encoding="utf-8")
     assert main(["check-config", str(path)]) == EXIT_CONFIG
     assert re.search(words, capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(
+    ("source", "idle"),
+    [
+        ("device:/dev/video0", ""),
+        ("picamera2:0", "format"),
+        ("gstreamer:v4l2src ! appsink", "gain, format, width_px, fps"),
+        ("rtsp://10.0.0.2/live", "stamp_of, gain, format, width_px, fps"),
+        ("folder:pictures", "latency_ms, stamp_of, exposure_ms, gain, format, width_px, fps"),
+    ],
+)
+def test_keys_that_a_source_has_no_use_for_are_named(
+    source: str, idle: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "config.toml"
+    text = (ROOT / "config" / "pi5.toml").read_text(encoding="utf-8")
+    given = f'source = "{source}"\ngain = 2.0\nstamp_of = "frame_end"\n'
+    path.write_text(re.sub(r"(?m)^(height_px = .*\n)(?=fps)|^source = .*\n", "", text).replace(
+        "[camera]\n", f"[camera]\n{given}", 1
+    ), encoding="utf-8")  # fmt: skip
+    assert main(["check-config", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert (f"[camera] {idle}: " in said) if idle else ("has no use" not in said)
 
 
 def test_the_page_about_every_key_is_the_codes(capsys: pytest.CaptureFixture[str]) -> None:

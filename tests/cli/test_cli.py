@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 import shutil
 import subprocess
@@ -21,6 +22,7 @@ from ortholoc_edge.bench import draw
 from ortholoc_edge.bench.replay import PriorKind
 from ortholoc_edge.cli import EXIT_CONFIG, EXIT_FAILED, main
 from ortholoc_edge.config import read_intrinsics
+from ortholoc_edge.errors import CameraError
 from ortholoc_edge.geometry.rigid import Rigid3
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -216,6 +218,28 @@ def test_wrong_configuration(
     assert told.out == ""
     assert str(path) in told.err
     assert re.search(named, told.err)
+
+
+@pytest.mark.parametrize("command", ["run", "doctor"])
+def test_libraries_are_told_before_anything_has_threads(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """OpenCV takes some settings from the environment alone, and there a change races with whoever reads."""
+    path = tmp_path / "stream.toml"
+    path.write_text(CONFIG.replace('"device:/dev/video0"', '"rtsp://10.0.0.2/live"'), encoding="utf-8")
+    # Put back after the test.
+    monkeypatch.setenv("OPENCV_FFMPEG_CAPTURE_OPTIONS", "")
+    monkeypatch.delenv("OPENCV_FFMPEG_CAPTURE_OPTIONS")
+    told = []
+
+    def begin(*_: object) -> list[object]:
+        told.append(os.environ.get("OPENCV_FFMPEG_CAPTURE_OPTIONS"))
+        raise CameraError("that is enough")
+
+    monkeypatch.setattr("ortholoc_edge.cli.run.Daemon", begin)
+    monkeypatch.setattr("ortholoc_edge.preflight.check_computer", begin)
+    assert run(command, "--config", path, *(["--computer"] if command == "doctor" else [])) == EXIT_FAILED
+    assert told and told[0] is not None and "nobuffer" in told[0]
 
 
 def test_missing_files_are_named(

@@ -210,9 +210,17 @@ def test_a_camera_that_gives_nothing_dark_frozen_slow_or_other_frames(good: Conf
     assert subjects(Look((size,) * 3, (90.0,) * 3, 0, 0, 29.0)) == []
     assert subjects(Look((), (), 0, 2, None)) == ["no frame in 5 s"]
     assert subjects(Look((size,) * 3, (90.0,) * 3, 0, 0, 8.0)) == ["8.0 frames per second"]
-    assert subjects(Look((size,) * 3, (3.0,) * 3, 0, 0, 29.0)) == ["brightness 3 of 255"]
+    assert subjects(Look((size,) * 3, (3.0,) * 3, 2, 0, 29.0)) == ["brightness 3 of 255"], "under its lens cap"
+    light = with_(device, picture={"min_brightness": 30.0})
+    assert subjects(Look((size,) * 3, (25.0,) * 3, 0, 0, 29.0), light) == ["brightness 25 of 255"]
+    assert subjects(Look((size,) * 3, (25.0,) * 3, 0, 0, 29.0)) == []
     assert subjects(Look((size,) * 3, (90.0,) * 3, 2, 0, 29.0)) == ["the same picture again and again"]
     assert subjects(Look((size,) * 3, (90.0,) * 3, 2, 0, 29.0), good) == [], "a folder may have one picture twice"
+    stream = with_(good, camera={"source": "rtsp://10.0.0.2/live", "latency_ms": 90.0, "fps": 30.0})
+    frozen_and_slow = Look((size,) * 3, (90.0,) * 3, 2, 0, 8.0)
+    assert subjects(frozen_and_slow, stream) == ["the same picture again and again"], "nobody asked it for a rate"
+    csi = with_(good, camera={"source": "picamera2:0", "fps": 30.0})
+    assert subjects(frozen_and_slow, csi) == ["8.0 frames per second", "the same picture again and again"]
     assert subjects(Look(((6, 4),), (90.0,), 0, 0, None)) == ["frames of 6 x 4 px"]
     assert subjects(Look((size,), (90.0,), 0, 3, None)) == ["3 of 4 frames can't be read"]
 

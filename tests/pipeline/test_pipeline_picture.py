@@ -91,6 +91,8 @@ def test_reasons() -> None:
     long = refusal(noise(), repeats=5)
     assert long is not None and (long.reason, long.measured, long.limit) == (Reason.FROZEN, 6, 5)
     assert "unplug" in long.detail
+    capped = refusal(np.zeros_like(noise()), repeats=9)
+    assert capped is not None and capped.reason is Reason.DARK, "a lens cap is no frozen camera"
     assert refusal(noise(), repeats=9, refuse_repeated=False) is None
     smeared = refusal(noise(), smear_px=OPTIONS.max_blur_px + 1)
     assert smeared is not None and smeared.reason is Reason.MOTION_BLUR and "20 ms" in smeared.detail

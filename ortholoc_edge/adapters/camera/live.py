@@ -22,6 +22,8 @@ _BACKOFF_MIN_S, _BACKOFF_MAX_S = 0.5, 2.0
 # A camera that fails this often in a row, or gives nothing for so long, is opened anew.
 _MAX_FAILED_GRABS = 5
 _SILENT_NS = 2 * _S
+# No driver waits for so long that lets go at all: opening takes 5 s, a frame 3; a name that nobody resolves up to 20.
+_HUNG_NS = 20 * _S
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,10 +43,17 @@ class Shot:
     defect: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class Late:
+    """A frame that lay in a queue, so that its arrival tells nothing; 0 where that can't be told yet."""
+
+    late_ns: int
+
+
 class OpenCamera(Protocol):
     """A camera that is open; used by one thread."""
 
-    def grab(self) -> Shot | None:
+    def grab(self) -> Shot | Late | None:
         """Wait for the next frame, some seconds at most; None if none came.
 
         Raises: CameraError if the camera can never be used.
@@ -61,7 +70,7 @@ class DeviceSource:
     queued one.
 
     A device that is missing, pulled out or silent is opened again with a growing pause; meanwhile `read`
-    returns None.
+    returns None. Where its driver keeps the thread, `read` raises CameraError: nothing but another process helps.
     """
 
     def __init__(self, name: str, opened: Callable[[], OpenCamera | None], clock: Clock) -> None:
@@ -80,17 +89,21 @@ class DeviceSource:
         self.reconnects = 0
         self.failed_grabs = 0
         self.damaged = 0
+        self.left_out = 0
+        self._is_late_told = False
         self._number = 0
+        self._beat_ns = clock.now_ns()
         self._thread = threading.Thread(target=self._run, name="camera", daemon=True)
         self._thread.start()
 
     def counts(self) -> dict[str, int]:
-        """Since the start: frames that came, that were damaged, and that a newer one replaced unread; grabs that
-        failed; how often it was opened again."""
+        """Since the start: frames that came, that were damaged, and that a newer one replaced unread; those that
+        were left out since they lay in a queue; grabs that failed; how often it was opened again."""
         return {
             "frames": self._number,
             "damaged": self.damaged,
             "overwritten": self.overwritten,
+            "left_out": self.left_out,
             "failed_grabs": self.failed_grabs,
             "reconnects": self.reconnects,
         }
@@ -109,6 +122,12 @@ class DeviceSource:
             if self._failure is not None:
                 raise CameraError(f"camera {self._name}: its thread ended; see the log") from self._failure
             latest, self._latest = self._latest, None
+        hung_ns = self._clock.now_ns() - self._beat_ns
+        if latest is None and hung_ns > _HUNG_NS:
+            raise CameraError(
+                f"camera {self._name}: its driver has not come back for {hung_ns / _S:.0f} s; start the program "
+                "afresh, as systemd does, and look at cable and supply if that does not help"
+            )
         if isinstance(latest, BadFrameError):
             raise latest
         return latest
@@ -137,16 +156,17 @@ class DeviceSource:
         backoff_s = _BACKOFF_MIN_S
         failures = 0
         while not self._stop.is_set():
+            self._beat_ns = self._clock.now_ns()
             camera = self._opened()
             if camera is not None:
                 before = self._number
                 try:
-                    self._grab_until_broken(camera)
+                    what = self._grab_until_broken(camera)
                 finally:
+                    self._beat_ns = self._clock.now_ns()
                     camera.release()
                 if self._number > before:
                     backoff_s, failures = _BACKOFF_MIN_S, 0
-                what = "lost"
             else:
                 what = "can't be opened"
             if self._stop.is_set():
@@ -159,16 +179,28 @@ class DeviceSource:
             self._stop.wait(backoff_s)
             backoff_s = min(2.0 * backoff_s, _BACKOFF_MAX_S)
 
-    def _grab_until_broken(self, camera: OpenCamera) -> None:
+    def _grab_until_broken(self, camera: OpenCamera) -> str:
+        """Why it is to be opened anew."""
         failed, last_ns = 0, self._clock.now_ns()
+        late_since_ns: int | None = None
         while not self._stop.is_set():
+            self._beat_ns = self._clock.now_ns()
             shot = camera.grab()
             if shot is None:
                 failed += 1
                 self.failed_grabs += 1
                 if failed >= _MAX_FAILED_GRABS or self._clock.now_ns() - last_ns >= _SILENT_NS:
-                    return
+                    return "lost"
                 continue
+            if isinstance(shot, Late):
+                self._leave_out(shot)
+                now_ns = self._clock.now_ns()
+                late_since_ns = late_since_ns or now_ns
+                # A queue that does not run dry; a new connection has none.
+                if now_ns - late_since_ns >= _SILENT_NS:
+                    return f"late by {shot.late_ns / 1e6:.0f} ms all the time"
+                continue
+            late_since_ns = None
             failed, last_ns = 0, self._clock.now_ns()
             name = str(self._number)
             self._number += 1
@@ -182,3 +214,14 @@ class DeviceSource:
                 self.overwritten += self._latest is not None
                 self._latest = latest
                 self._condition.notify_all()
+        return "closed"
+
+    def _leave_out(self, late: Late) -> None:
+        self.left_out += 1
+        if late.late_ns and not self._is_late_told:
+            self._is_late_told = True
+            logger.warning(
+                "camera %s: a frame comes %.0f ms later than others; such frames are left out, since they are stamped "
+                "by their arrival, and counted (left_out); look at what lies between it and this computer",
+                self._name, late.late_ns / 1e6,
+            )  # fmt: skip

@@ -10,14 +10,25 @@ from ortholoc_edge.adapters.camera.files import FolderSource, VideoSource
 from ortholoc_edge.adapters.camera.live import DeviceSource, OpenCamera
 from ortholoc_edge.adapters.camera.options import CameraOptions
 from ortholoc_edge.adapters.camera.source import FrameSource
-from ortholoc_edge.adapters.camera.stream import open_network, prepare_network, shown_address
-from ortholoc_edge.adapters.camera.v4l2 import V4l2Camera, device_path, prepare
+from ortholoc_edge.adapters.camera.stream import NETWORK, open_network, prepare_network
+from ortholoc_edge.adapters.camera.v4l2 import V4l2Camera, device_path, prepare_devices
 from ortholoc_edge.adapters.camera.zenoh_frames import ZenohFrames
+from ortholoc_edge.adapters.secret import without_credentials
 from ortholoc_edge.clock import Clock
 from ortholoc_edge.errors import ConfigError
 
 if TYPE_CHECKING:
     from ortholoc_edge.adapters.bus import Bus
+
+
+def prepare(options: CameraOptions) -> None:
+    """Tell OpenCV, by the environment, what it takes from there alone. Before there are threads: while one sets a
+    variable another may not read one, and libraries do at any time. Without it sources work, with longer waits.
+    """
+    if options.kind == "device":
+        prepare_devices()
+    elif options.kind in NETWORK:
+        prepare_network()
 
 
 def open_source(options: CameraOptions, clock: Clock, bus: Bus | None = None) -> FrameSource:
@@ -28,7 +39,7 @@ def open_source(options: CameraOptions, clock: Clock, bus: Bus | None = None) ->
     Raises: ConfigError if the text can't be understood; CameraError if a folder or video can't be read, or a library
         is missing. A live camera that is missing is waited for instead.
     """
-    kind, _, rest = options.source.partition(":")
+    kind, rest = options.kind, options.place
     if kind == "folder" and rest:
         return FolderSource(Path(rest), options.rate_hz, clock)
     if kind == "video" and rest:
@@ -37,19 +48,18 @@ def open_source(options: CameraOptions, clock: Clock, bus: Bus | None = None) ->
         if bus is None:
             raise ConfigError(f"camera source {options.source!r} comes over the bus; set [bus] enabled = true")
         return ZenohFrames(bus, rest, options, clock)
-    name, opened = _live(kind, rest, options, clock)
+    name, opened = _live(options, clock)
     return DeviceSource(name, opened, clock)
 
 
-def _live(kind: str, rest: str, options: CameraOptions, clock: Clock) -> tuple[str, Callable[[], OpenCamera | None]]:
+def _live(options: CameraOptions, clock: Clock) -> tuple[str, Callable[[], OpenCamera | None]]:
     """The name, and what opens it."""
+    kind, rest = options.kind, options.place
     if kind == "device" and rest:
         path = device_path(rest)
-        prepare()
         return path, lambda: V4l2Camera.open(path, options, clock)
-    if kind in ("rtsp", "http", "https") and rest.startswith("//"):
-        prepare_network()
-        return shown_address(options.source), lambda: open_network(options.source, options, clock)
+    if kind in NETWORK and rest.startswith("//"):
+        return without_credentials(options.source), lambda: open_network(options.source, options, clock)
     if kind == "gstreamer" and rest:
         # Not at the top: the bindings come with the system, and few have them.
         from ortholoc_edge.adapters.camera.gstreamer import GstreamerCamera, load, low_latency
@@ -65,6 +75,6 @@ def _live(kind: str, rest: str, options: CameraOptions, clock: Clock) -> tuple[s
         number = int(rest or "0")
         return f"picamera2:{number}", lambda: Picamera.open(number, options, clock)
     raise ConfigError(
-        f"camera source {shown_address(options.source)!r} can't be used; write folder:PATH, video:PATH, "
+        f"camera source {without_credentials(options.source)!r} can't be used; write folder:PATH, video:PATH, "
         "device:/dev/video0, picamera2:0, rtsp://..., http://..., gstreamer:PIPELINE or zenoh:KEY"
     )

@@ -7,6 +7,28 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+_MS = 1_000_000
+# Of keys that not every kind of source has a use for: those that have.
+_SET = ("device", "picamera2")
+_STAMPED = (*_SET, "gstreamer")
+_LIVE = (*_STAMPED, "rtsp", "http", "https", "zenoh")
+_USED_BY = {
+    "rate_hz": (*_SET, "folder"),
+    "latency_ms": _LIVE,
+    "stamps": (*_STAMPED, "zenoh"),
+    "stamp_of": _STAMPED,
+    "driver_latency_ms": (*_STAMPED, "zenoh"),
+    "exposure_ms": _LIVE,
+    "gain": _SET,
+    "format": ("device",),
+    "shutter": _STAMPED,
+    "readout_ms": _STAMPED,
+    "width_px": _SET,
+    "height_px": _SET,
+    "fps": _SET,
+    "realtime": ("video",),
+}
+
 PixelFormat = Literal["MJPG", "YUYV", "UYVY", "NV12", "YU12", "GREY", "RGB3", "BGR3"]
 
 
@@ -49,9 +71,38 @@ class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     realtime: bool = True
 
     @property
+    def kind(self) -> str:
+        """What stands before the colon of ``source``: "device", "rtsp", …; of a text that is none, the text."""
+        return self.source.partition(":")[0]
+
+    @property
+    def place(self) -> str:
+        """What stands behind it."""
+        return self.source.partition(":")[2]
+
+    @property
+    def is_live(self) -> bool:
+        """Whether what it shows happens now: a folder and a video may show the same twice."""
+        return self.kind not in ("folder", "video")
+
+    def idle_keys(self) -> list[str]:
+        """Keys that were given a value other than their default, and that this kind of source has no use for."""
+        return [
+            field.name
+            for field in msgspec.structs.fields(self)
+            if field.name in _USED_BY
+            and self.kind not in _USED_BY[field.name]
+            and getattr(self, field.name) != field.default
+        ]
+
+    @property
+    def fixed_exposure_ns(self) -> int | None:
+        """``exposure_ms`` where it is a number."""
+        return round(self.exposure_ms * _MS) if isinstance(self.exposure_ms, float | int) else None
+
+    @property
     def lateness(self) -> tuple[Literal["driver_latency_ms", "latency_ms"], float]:
         """Which key corrects the stamps of this source, and its value."""
-        kind = self.source.partition(":")[0]
-        if self.stamps == "driver" and kind in ("device", "picamera2", "gstreamer", "zenoh"):
+        if self.stamps == "driver" and self.kind in ("device", "picamera2", "gstreamer", "zenoh"):
             return "driver_latency_ms", self.driver_latency_ms
         return "latency_ms", self.latency_ms

@@ -85,6 +85,8 @@ class Picamera:
         try:
             request = self._device.capture_request(wait=_WAIT_S)
         except TimeoutError:
+            # The capture waits on at the head of Picamera2's list, and a stop behind it would wait for ever.
+            self._device.cancel_all_and_flush()
             return None
         arrival_ns = self._clock.now_ns()
         try:
@@ -107,11 +109,11 @@ class Picamera:
         return None if stamp_ns is None else Shot(frozen_rgb(image, f"camera {self._name}"), stamp_ns, exposure_ns)
 
     def _compare(self, exposure_ns: int, gain: float | None) -> None:
-        wanted = self._options.exposure_ms
-        if isinstance(wanted, float | int) and abs(exposure_ns / _MS - wanted) > max(0.1, 0.1 * wanted):
+        wanted_ns = self._options.fixed_exposure_ns
+        if wanted_ns is not None and abs(exposure_ns - wanted_ns) > max(0.1 * _MS, 0.1 * wanted_ns):
             logger.warning(
                 "camera %s: exposure is %g ms, not %g ms; a frame has no longer one than its period",
-                self._name, exposure_ns / _MS, wanted,
+                self._name, exposure_ns / _MS, wanted_ns / _MS,
             )  # fmt: skip
         asked = self._options.gain
         if asked is not None and gain is not None and abs(gain - asked) > max(0.1, 0.1 * asked):

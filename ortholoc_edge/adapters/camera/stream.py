@@ -8,15 +8,18 @@ import os
 
 import cv2
 
-from ortholoc_edge.adapters.camera.live import Shot
+from ortholoc_edge.adapters.camera.live import Late, Shot
 from ortholoc_edge.adapters.camera.options import CameraOptions
 from ortholoc_edge.adapters.camera.pictures import rgb
+from ortholoc_edge.adapters.camera.stamps import Arrivals
 from ortholoc_edge.adapters.secret import without_credentials
 from ortholoc_edge.clock import Clock
 
 logger = logging.getLogger(__name__)
 
 _MS = 1_000_000
+# Kinds of sources that are addresses.
+NETWORK = ("rtsp", "http", "https")
 # FFmpeg's own are 30 s, in which a vehicle flies far.
 _OPEN_TIMEOUT_MS, _READ_TIMEOUT_MS = 5000, 3000
 # OpenCV takes FFmpeg's options from the environment alone, each time it opens a stream.
@@ -28,24 +31,32 @@ _LOW_LATENCY = "rtsp_transport;tcp|fflags;nobuffer|flags;low_delay"
 class StreamCamera:
     """See `OpenCamera`."""
 
-    def __init__(self, name: str, capture: cv2.VideoCapture, options: CameraOptions, clock: Clock) -> None:
+    def __init__(
+        self, name: str, capture: cv2.VideoCapture, options: CameraOptions, clock: Clock, is_timed: bool
+    ) -> None:
         """
         Args:
             name: for messages.
             capture: open.
+            is_timed: frames come with the camera's time.
         """
         self._name, self._capture, self._clock = name, capture, clock
         self._latency_ns = round(options.latency_ms * _MS)
+        self._is_timed, self._arrivals = is_timed, Arrivals()
         # What it was set to where it stands.
-        fixed = isinstance(options.exposure_ms, float | int)
-        self._exposure_ns = round(float(options.exposure_ms) * _MS) if fixed else None  # type: ignore[arg-type]
+        self._exposure_ns = options.fixed_exposure_ns
 
-    def grab(self) -> Shot | None:
+    def grab(self) -> Shot | Late | None:
         """See `OpenCamera.grab`."""
         if not self._capture.grab():
             return None
-        # At once: decoding takes its time and is no part of the delay that the options state.
-        stamp_ns = self._clock.now_ns() - self._latency_ns
+        # Decoded by then, which is part of the delay that the options state; conversion to RGB, which follows, is not.
+        arrival_ns = self._clock.now_ns()
+        own_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * _MS) if self._is_timed else None
+        late_ns = self._arrivals.late_ns(own_ns, arrival_ns)
+        if late_ns is not None:
+            return Late(late_ns)
+        stamp_ns = arrival_ns - self._latency_ns
         good, image = self._capture.retrieve()
         if not good or image is None:
             return None
@@ -56,14 +67,8 @@ class StreamCamera:
         self._capture.release()
 
 
-def shown_address(address: str) -> str:
-    """An address for messages: without name, password and what stands behind a question mark, which may be one too."""
-    before, mark, _ = without_credentials(address).partition("?")
-    return f"{before}?…" if mark else before
-
-
 def prepare_network() -> None:
-    """What FFmpeg has to know before it opens a stream; before there are threads. What the user has set stays."""
+    """What FFmpeg has to know before it opens a stream; see `opening.prepare`. What the user has set stays."""
     os.environ.setdefault(_FFMPEG_OPTIONS, _LOW_LATENCY)
 
 
@@ -81,6 +86,8 @@ def open_network(address: str, options: CameraOptions, clock: Clock) -> StreamCa
     if not capture.isOpened():
         capture.release()
         return None
-    name = shown_address(address)
+    name = without_credentials(address)
     logger.info("camera %s open", name)
-    return StreamCamera(name, capture, options, clock)
+    # Pictures over HTTP have no time of their own: FFmpeg counts them as if there were 25 a second.
+    is_timed = address.startswith("rtsp:") or capture.get(cv2.CAP_PROP_FOURCC) != cv2.VideoWriter.fourcc(*"MJPG")
+    return StreamCamera(name, capture, options, clock, is_timed)

@@ -283,8 +283,8 @@ def _list(formats: tuple[str, ...]) -> str:
 # -- frames --------------------------------------------------------------------------------------------
 
 
-def prepare() -> None:
-    """What OpenCV has to know before it opens the first device; before there are threads."""
+def prepare_devices() -> None:
+    """What OpenCV has to know before it opens the first device; see `opening.prepare`."""
     os.environ.setdefault(*_SELECT_TIMEOUT)
 
 
