@@ -183,7 +183,7 @@ class Daemon:
                 snapshots=_snapshot_folder(config),
             )
             self._bus = (
-                resources.enter_context(closing(bus_of(config.bus, config.camera.source, os.environ)))
+                resources.enter_context(closing(bus_of(config.bus, config.camera, os.environ)))
                 if config.bus.enabled
                 else None
             )

@@ -67,7 +67,7 @@ def check_computer(config: Config, clock: Clock, environ: Mapping[str, str]) -> 
             def opened() -> FrameSource:
                 bus = None
                 if config.camera.kind == "zenoh" and config.bus.enabled:
-                    bus = bus_of(config.bus, config.camera.source, environ)
+                    bus = bus_of(config.bus, config.camera, environ)
                     closed_last.callback(bus.close)
                 return open_source(config.camera, clock, bus)
 

@@ -40,6 +40,8 @@ from ortholoc_edge.geometry.arrays import ImageArray
 if TYPE_CHECKING:
     import zenoh  # 4 MB, so where the bus is off it is not imported
 
+    from ortholoc_edge.adapters.camera import CameraOptions
+
 logger = logging.getLogger(__name__)
 
 _S = 1_000_000_000
@@ -354,11 +356,10 @@ class Bus:
             self._thread.join(timeout=1.0)
 
 
-def bus_of(options: BusOptions, camera_source: str, environ: Mapping[str, str]) -> Bus:
+def bus_of(options: BusOptions, camera: CameraOptions, environ: Mapping[str, str]) -> Bus:
     """As configured, with systemd's credentials. Raises: ConfigError, LinkError."""
     credentials = environ.get("CREDENTIALS_DIRECTORY")
-    takes_pictures = camera_source.startswith("zenoh:")
-    return Bus(options, Path(credentials) if credentials else None, takes_pictures=takes_pictures)
+    return Bus(options, Path(credentials) if credentials else None, takes_pictures=camera.kind == "zenoh")
 
 
 _TOPIC_OF = {kind: name for name, kind in PUBLISHED.items()}

@@ -104,7 +104,7 @@ class ZenohFrames:
         self._latency_ns, self._own_late_ns = round(options.latency_ms * _MS), round(options.driver_latency_ms * _MS)
         self._stamps = DriverStamps()
         self._stamps.believed = options.stamps == "driver"
-        self._exposure_ns = round(options.exposure_ms * _MS) if isinstance(options.exposure_ms, float | int) else None
+        self._exposure_ns = options.fixed_exposure_ns
         self._condition = threading.Condition()
         self._waiting: _Arrival | None = None
         self._closed = False
