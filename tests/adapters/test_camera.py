@@ -24,6 +24,7 @@ from ortholoc_edge.adapters.camera import (
     open_source,
     read_image,
 )
+from ortholoc_edge.adapters.camera.live import Late
 from ortholoc_edge.adapters.camera.pictures import rgb
 from ortholoc_edge.clock import ManualClock, SystemClock
 from ortholoc_edge.errors import CameraError, ConfigError
@@ -394,6 +395,38 @@ def test_a_driver_that_never_comes_back_is_an_error(where):
     finally:
         camera.freed.set()
         source.close()
+
+
+class Behind:
+    """A stream whose queue does not run dry: every frame comes 0.1 s after the one before, and late."""
+
+    def __init__(self, clock: ManualClock) -> None:
+        self.clock, self.released = clock, threading.Event()
+        self.grabbed = 0
+
+    def grab(self):
+        self.grabbed += 1
+        self.clock.set_ns(self.clock.now_ns() + 100 * MS)
+        return Late(0 if self.grabbed < 4 else 700 * MS)
+
+    def release(self):
+        self.released.set()
+
+
+def test_a_stream_that_stays_late_is_opened_again(caplog):
+    clock = ManualClock(10**9)
+    camera = Behind(clock)
+    source = DeviceSource("far", lambda: None if camera.released.is_set() else camera, clock)
+    try:
+        deadline = time.monotonic() + 10.0
+        while not source.reconnects and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert camera.released.is_set() and source.read(0.0) is None
+    finally:
+        source.close()
+    assert 15 <= camera.grabbed <= 30 and source.counts()["left_out"] == camera.grabbed
+    assert caplog.text.count("a frame comes 700 ms later than others") == 1
+    assert "camera far late by 700 ms all the time; trying again" in caplog.text
 
 
 # -- options -------------------------------------------------------------------

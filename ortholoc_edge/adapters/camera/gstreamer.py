@@ -119,7 +119,7 @@ class GstreamerCamera:
                 return None
             buffer = sample.get_buffer()
             own_ns = None if buffer.pts == _NO_TIME else int(buffer.pts)
-            if self._options.stamps == "arrival":
+            if not self._stamper.believes:
                 late_ns = self._arrivals.late_ns(own_ns, arrival_ns)
                 if late_ns is not None:
                     return Late(late_ns)

@@ -150,6 +150,11 @@ class Stamper:
         self.stamp_of = told if options.stamp_of == "auto" else StampOf(options.stamp_of)
         self._judged = DriverStamps()
 
+    @property
+    def believes(self) -> bool:
+        """Whether the driver's stamps count, and not arrivals."""
+        return self._options.stamps == "driver" and self._judged.believed
+
     def stamp_ns(self, driver_ns: int, arrival_ns: int, exposure_ns: int | None) -> int | None:
         """Of a frame; None where it is to be left out, because it lay in a queue or its stamp makes no sense. A clock
         that is none of ours is soon given up, which is said.
@@ -160,7 +165,7 @@ class Stamper:
         """
         options = self._options
         by_arrival_ns = arrival_ns - round(options.latency_ms * _MS)
-        if options.stamps == "arrival" or not self._judged.believed:
+        if not self.believes:
             return by_arrival_ns
         if self._judged.judge(driver_ns, arrival_ns):
             middle_ns = mid_exposure_minus_stamp_ns(
