@@ -380,6 +380,8 @@ def _session_config(options: BusOptions, credentials: Path | None, most_received
         "scouting/multicast/enabled": False,
         "listen/endpoints": list(options.listen),
         "transport/link/rx/max_message_size": most_received_bytes,
+        # Between programs of one computer zenoh would copy through two pools of 16 MB, which fill within the hour.
+        "transport/shared_memory/enabled": False,
         **_tls_settings(options.tls, credentials),
     }
     if options.connect:
