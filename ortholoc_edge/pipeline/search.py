@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import cv2
@@ -19,6 +19,7 @@ import numpy as np
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, ImageArray
 from ortholoc_edge.geometry.camera import Camera
+from ortholoc_edge.geometry.grid import RasterGrid
 from ortholoc_edge.matching.orientation import orientation_field
 from ortholoc_edge.pipeline.rectify import rectified
 from ortholoc_edge.tiles.coarse import MEAN_PX, CoarseField
@@ -30,11 +31,18 @@ _ZOOM: Final = 1.09
 # Side of the blocks that are transformed. Larger ones waste less on their rims, and more of the cache.
 _BLOCK_PX: Final = 1024
 _MAX_CANVAS_PX: Final = 256
-# A frame with less to see than this is not looked for, px.
+# A frame with less to see than this is not looked for, px; and from so many on its edges tell it from others.
 _MIN_CANVAS_PX: Final = 24
+_ENOUGH_PX: Final = 56
 # Places closer than this are the same, px.
 _APART_PX: Final = 8
 _PER_BLOCK: Final = 8
+# Beyond this the heading is looked for at half the scale first, and so many of the places found there at full scale.
+_NARROW_RAD: Final = math.radians(25.0)
+_LOOKED_AT: Final = 150
+_SMALL_BLOCK_PX: Final = 256
+# Templates of a block are held in memory at a time: 8 MB each at 1024 px.
+_AT_A_TIME: Final = 12
 # Of the map's mean energy: where there is less, a frame that fits well does so by chance.
 _LEAST_ENERGY: Final = 0.3
 
@@ -102,30 +110,91 @@ class _Template:
     pixels: int
 
 
-def search(
-    sighting: Sighting, field: CoarseField, *, count: int = 20, threads: int = 2, block_px: int = _BLOCK_PX
-) -> list[Candidate]:
-    """The places where a frame fits best, the best first, each apart from the others.
+def fitting_level(grids: Sequence[RasterGrid], camera: Camera, above_ground_m: float) -> int:
+    """Of the levels of an orthophoto, finest first: the coarsest at which a frame taken straight down shows enough; the
+    finest if none is."""
+    short_m = above_ground_m * min(camera.width / camera.fx, camera.height / camera.fy)
+    fine = [level for level, grid in enumerate(grids) if short_m >= _ENOUGH_PX * grid.gsd_m]
+    return fine[-1] if fine else 0
+
+
+class Searcher:
+    """A map to look for frames in. Safe to use from several threads.
 
     Args:
-        count: of places.
-        threads: that share the work.
-    Returns: an empty list where the frame shows too little ground for the field's pixels, or has no edges.
+        field: of the map.
+        threads: that share the work of one search.
     """
-    found: list[Candidate] = []
-    with ThreadPoolExecutor(threads, thread_name_prefix="search") as pool:
-        for above_m, blocks in _heights(sighting, field, block_px):
-            templates = [
-                template
-                for zoom in _zooms(sighting.height_reach)
-                for turn_rad in _turns(sighting.heading_reach_rad)
-                if (template := _template(sighting, field, above_m * zoom, turn_rad, block_px)) is not None
-            ]
-            if not templates:
-                continue
-            for part in pool.map(lambda block, those=templates: _search_block(field, block, those, block_px), blocks):
-                found += part
-    return distinct(found, _APART_PX * field.grid.gsd_m, count)
+
+    def __init__(self, field: CoarseField, threads: int = 2) -> None:
+        self.field = field
+        self._half = field.halved()
+        self._pool = ThreadPoolExecutor(threads, thread_name_prefix="search")
+
+    def close(self) -> None:
+        self._pool.shutdown()
+
+    def search(self, sighting: Sighting, count: int = 20) -> list[Candidate]:
+        """The places where a frame fits best, the best first, each apart from the others by `_APART_PX`.
+
+        Args:
+            count: of places.
+        Returns: an empty list where the frame shows too little ground for the field's pixels, or has no edges.
+        """
+        if sighting.heading_reach_rad <= _NARROW_RAD:
+            found = self._everywhere(sighting, _Scale(self.field, 1, _TURN_RAD, _BLOCK_PX))
+        else:
+            # At half the scale, in steps twice as wide, an eighth of the work; whatever is promising there is looked at
+            # again.
+            rough = self._everywhere(sighting, _Scale(self._half, 2, 2.0 * _TURN_RAD, _BLOCK_PX // 2))
+            apart_m = _APART_PX * self.field.grid.gsd_m
+            again = [self._pool.submit(self._near, sighting, place) for place in distinct(rough, apart_m, _LOOKED_AT)]
+            found = [candidate for future in again for candidate in future.result()]
+        return distinct(found, _APART_PX * self.field.grid.gsd_m, count)
+
+    def _everywhere(self, sighting: Sighting, scale: _Scale) -> list[Candidate]:
+        found: list[Candidate] = []
+        turns = _turns(sighting.heading_reach_rad, scale.turn_rad)
+        for above_m, blocks in _heights(sighting, scale):
+            tried = [(above_m * zoom, turn_rad) for zoom in _zooms(sighting.height_reach) for turn_rad in turns]
+            for first in range(0, len(tried), _AT_A_TIME):
+                made = self._pool.map(
+                    lambda pair: _template(sighting, scale, *pair), tried[first : first + _AT_A_TIME]
+                )
+                templates = [template for template in made if template is not None]
+                if not templates:
+                    continue
+                for part in self._pool.map(
+                    lambda block, those=templates: _search_block(scale, block, those, _PER_BLOCK), blocks
+                ):
+                    found += part
+        return found
+
+    def _near(self, sighting: Sighting, place: Candidate) -> list[Candidate]:
+        """The best place around one that was found at half the scale, at full scale."""
+        scale = _Scale(self.field, 1, _TURN_RAD, _SMALL_BLOCK_PX)
+        side = 4 * _APART_PX
+        if _SMALL_BLOCK_PX < side + 2 * _margin_px(sighting, scale):
+            scale = replace(scale, block_px=_BLOCK_PX)
+        column, row = np.round(self.field.grid.px_from_map((place.easting_m, place.northing_m))).astype(int).tolist()
+        block = _Block(column - side // 2, row - side // 2, side)
+        templates = [
+            template
+            for turn_rad in (place.turn_rad - _TURN_RAD, place.turn_rad, place.turn_rad + _TURN_RAD)
+            if (template := _template(sighting, scale, place.above_ground_m, turn_rad)) is not None
+        ]
+        return _search_block(scale, block, templates, 1) if templates else []
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scale:
+    """A pass over the map: its field, by how much coarser than what frames are rectified for, the step of the heading
+    and the side of the blocks."""
+
+    field: CoarseField
+    halving: int
+    turn_rad: float
+    block_px: int
 
 
 def distinct(found: Sequence[Candidate], apart_m: float, count: int) -> list[Candidate]:
@@ -139,13 +208,10 @@ def distinct(found: Sequence[Candidate], apart_m: float, count: int) -> list[Can
     return kept
 
 
-def _turns(reach_rad: float) -> list[float]:
-    if reach_rad >= math.pi - _TURN_RAD:
-        count = math.ceil(2.0 * math.pi / _TURN_RAD)
-        return [2.0 * math.pi * k / count - math.pi for k in range(count)]
-    count = max(math.ceil(2.0 * reach_rad / _TURN_RAD), 1)
+def _turns(reach_rad: float, step_rad: float) -> list[float]:
+    count = max(math.ceil(2.0 * min(reach_rad, math.pi) / step_rad), 1)
     # The middles of equal parts.
-    return [reach_rad * ((2 * k + 1) / count - 1.0) for k in range(count)]
+    return [min(reach_rad, math.pi) * ((2 * k + 1) / count - 1.0) for k in range(count)]
 
 
 def _zooms(reach: float) -> list[float]:
@@ -153,10 +219,9 @@ def _zooms(reach: float) -> list[float]:
     return [math.exp(math.log1p(reach) * ((2 * k + 1) / count - 1.0)) for k in range(count)]
 
 
-def _template(
-    sighting: Sighting, field: CoarseField, above_m: float, turn_rad: float, block_px: int
-) -> _Template | None:
-    gsd_m = field.grid.gsd_m
+def _template(sighting: Sighting, scale: _Scale, above_m: float, turn_rad: float) -> _Template | None:
+    halving, block_px = scale.halving, scale.block_px
+    gsd_m = scale.field.grid.gsd_m / halving
     map_from_camera = rotation.exp([0.0, 0.0, turn_rad]) @ sighting.map_from_camera
     # Pixels of a north-up grid whose origin is below the camera, to the frame's.
     ground_from_grid = np.array([[gsd_m, 0.0, 0.0], [0.0, -gsd_m, 0.0], [0.0, 0.0, -above_m]])
@@ -165,22 +230,27 @@ def _template(
     if seen is None or min(seen.image.shape) < _MIN_CANVAS_PX or max(seen.image.shape) > _MAX_CANVAS_PX:
         return None
     values = orientation_field(seen.image, seen.valid, MEAN_PX)
-    pixels = int(np.count_nonzero(seen.valid))
-    energy = float(np.square(values).sum())
+    rows, columns = (side // halving for side in values.shape[1:])
+    corner = np.linalg.solve(frame_from_grid, seen.frame_from_canvas)
+    # A halved pixel's centre lies between those of two.
+    x, y = (round((-low - 0.5 * (halving - 1)) / halving) for low in (corner[:2, 2] / corner[2, 2]).tolist())
+    pixels = int(np.count_nonzero(seen.valid)) // halving**2
+    parts = [
+        np.asarray(
+            cv2.resize(part[: rows * halving, : columns * halving], (columns, rows), interpolation=cv2.INTER_AREA),
+            dtype=np.float32,
+        )
+        for part in values
+    ]
+    energy = sum(float(np.square(part).sum()) for part in parts)
     if energy <= 0.0:
         return None
-    values /= np.float32(math.sqrt(energy * pixels))
-    corner = np.linalg.solve(frame_from_grid, seen.frame_from_canvas)
-    low = corner[:2, 2] / corner[2, 2]
-    rows = values.shape[1]
     spectra = []
-    for part in values:
+    for part in parts:
         padded = np.zeros((block_px, block_px), np.float32)
-        padded[:rows, : values.shape[2]] = part
+        np.multiply(part, np.float32(1.0 / math.sqrt(energy * pixels)), out=padded[:rows, :columns])
         spectra.append(np.asarray(cv2.dft(padded, nonzeroRows=rows)))
-    return _Template(
-        (spectra[0], spectra[1]), turn_rad, above_m, (round(-float(low[0])), round(-float(low[1]))), pixels
-    )
+    return _Template((spectra[0], spectra[1]), turn_rad, above_m, (x, y), pixels)
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,11 +266,11 @@ class _Block:
     heights: tuple[float, float] | None = None
 
 
-def _heights(sighting: Sighting, field: CoarseField, block_px: int) -> Iterator[tuple[float, list[_Block]]]:
+def _heights(sighting: Sighting, scale: _Scale) -> Iterator[tuple[float, list[_Block]]]:
     """Heights above ground to look from, and the blocks of the map that each holds in."""
     # A camera of a block needs the ground around it, up to half a canvas and more where it looks aslant.
-    side = block_px - 2 * _margin_px(sighting, field)
-    if side < block_px // 4:
+    field, side = scale.field, scale.block_px - 2 * _margin_px(sighting, scale)
+    if side < scale.block_px // 4:
         return
     blocks = [
         _Block(column, row, side)
@@ -229,9 +299,10 @@ def _steps(sighting: Sighting, field: CoarseField, block: _Block) -> Iterator[tu
         yield step, (sighting.height_m - _ZOOM ** (step + 0.75), sighting.height_m - _ZOOM ** (step - 0.75))
 
 
-def _margin_px(sighting: Sighting, field: CoarseField) -> int:
+def _margin_px(sighting: Sighting, scale: _Scale) -> int:
     """Pixels around a camera that its frame may show."""
-    camera, gsd_m = sighting.camera, field.grid.gsd_m
+    camera, field = sighting.camera, scale.field
+    gsd_m = field.grid.gsd_m
     above_m = sighting.above_ground_m
     if not math.isfinite(above_m):
         lowest = float(np.nanmin(field.ground)) if np.isfinite(field.ground).any() else 0.0
@@ -240,12 +311,12 @@ def _margin_px(sighting: Sighting, field: CoarseField) -> int:
     rays = camera.unproject(corners) @ sighting.map_from_camera.T
     slope = np.hypot(rays[:, 0], rays[:, 1]) / np.maximum(-rays[:, 2], 0.25)
     reach = (1.0 + sighting.height_reach) * above_m * float(np.nan_to_num(slope, nan=4.0).max()) / gsd_m
-    return min(math.ceil(reach) + 2, _MAX_CANVAS_PX)
+    return min(math.ceil(reach) + 3, _MAX_CANVAS_PX // scale.halving)
 
 
-def _search_block(
-    field: CoarseField, block: _Block, templates: Sequence[_Template], block_px: int
-) -> list[Candidate]:
+def _search_block(scale: _Scale, block: _Block, templates: Sequence[_Template], count: int) -> list[Candidate]:
+    """The ``count`` best places of a block, with the template that fits best at each."""
+    field, block_px = scale.field, scale.block_px
     margin = (block_px - block.side) // 2
     values = field.block(block.column - margin, block.row - margin, block_px)
     squares = np.square(values[0]) + np.square(values[1])
@@ -271,7 +342,7 @@ def _search_block(
     score = best / np.sqrt(np.maximum(energy, _LEAST_ENERGY * float(squares[squares > 0].mean())))
     if block.heights is not None:
         score[~_in_band(field, block)] = -np.inf
-    return list(_peaks(score, which, templates, field, block))
+    return list(_peaks(score, which, templates, field, block, count))
 
 
 def _in_band(field: CoarseField, block: _Block) -> BoolArray:
@@ -287,9 +358,14 @@ def _in_band(field: CoarseField, block: _Block) -> BoolArray:
 
 
 def _peaks(
-    score: Float32Array, which: np.ndarray, templates: Sequence[_Template], field: CoarseField, block: _Block
+    score: Float32Array,
+    which: np.ndarray,
+    templates: Sequence[_Template],
+    field: CoarseField,
+    block: _Block,
+    count: int,
 ) -> Iterator[Candidate]:
-    for _ in range(_PER_BLOCK):
+    for _ in range(count):
         row, column = divmod(int(score.argmax()), block.side)
         value = float(score[row, column])
         if not value > 0.0:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -69,6 +70,21 @@ class CoarseField:
                 np.rint(inner * _PER_UNIT), -_MOST, _MOST
             )
         return CoarseField(grid, quantised, surface.dsm, surface.dsm_grid)
+
+    def halved(self) -> CoarseField:
+        """The mean of every 2 x 2 pixels; what is left of them at the right and lower rim is left out."""
+        width, height = self.grid.width // 2, self.grid.height // 2
+        quantised = np.empty((2, height, width), np.int8)
+        for whole, half in zip(self.quantised, quantised, strict=True):
+            # OpenCV does not average signed bytes.
+            moved = np.asarray(whole[: 2 * height, : 2 * width], dtype=np.int16)
+            half[:] = np.rint(cv2.resize(moved, (width, height), interpolation=cv2.INTER_AREA))
+        return CoarseField(
+            self.grid.crop(0, 0, 2 * width, 2 * height).resized(width, height),
+            quantised,
+            self.ground,
+            self.ground_grid,
+        )
 
     @property
     def bytes(self) -> int:
