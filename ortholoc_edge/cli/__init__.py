@@ -18,8 +18,8 @@ EXIT_CONFIG = 78  # EX_CONFIG: systemd's RestartPreventExitStatus, a restart can
 # Each in the module of its name.
 _COMMANDS = (
     "sim", "run", "doctor", "bus", "check-config", "install-service", "replay", "localize", "locate",
-    "calibrate-focal", "tiles", "models", "samples", "bench", "bench-replay", "bench-core", "bench-link", "bench-bus", "bench-packs",
-    "bench-service", "profile",
+    "calibrate-focal", "tiles", "models", "samples", "bench", "bench-replay", "bench-core", "bench-link", "bench-bus",
+    "bench-packs", "bench-service", "profile",
 )  # fmt: skip
 
 

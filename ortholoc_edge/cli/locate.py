@@ -28,8 +28,8 @@ from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.matching.types import Structural
 from ortholoc_edge.pipeline.frame import Frame
-from ortholoc_edge.pipeline.locate import Located, locate
 from ortholoc_edge.pipeline.localizer import Localizer, LocalizerOptions
+from ortholoc_edge.pipeline.locate import Located, locate
 from ortholoc_edge.pipeline.outcome import Fix
 from ortholoc_edge.pipeline.record import outcome_record
 from ortholoc_edge.pipeline.search import Searcher, Sighting, fitting_level
@@ -47,11 +47,12 @@ _MAX_FIELD_PX = 100e6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Photo:
-    """A photo and what is known of it: the body's attitude from true north; the truth where a sequence has it."""
+    """A photo and what is known of it: the body's attitude from true north; camera and truth where a sequence has
+    them."""
 
     path: Path
     image: Callable[[], ImageArray]
-    camera: Callable[[ImageArray], Camera]
+    camera: Camera | None
     ned_from_body: FloatArray
     above_ground_m: float
     height_m: float
@@ -62,8 +63,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser(
         "locate",
         help="find photos in a whole map, without a position",
-        description="Finds each photo in the whole map, or the part that --within names, from attitude and height alone. "
-        "A folder with a *_flight.csv stands for its photos, with the attitude and height that it has for them, and "
+        description="Finds each photo in the whole map, or the part that --within names, from attitude and height "
+        "alone. A folder with a *_flight.csv stands for its photos, with the attitude and height that it has for them; "
         "its positions are only compared with. Exit code 0: all were found; 1: not all.",
     )
     parser.add_argument("photos", type=Path, nargs="+", metavar="IMAGE")
@@ -129,8 +130,8 @@ def _photos(path: Path, args: argparse.Namespace) -> Iterator[_Photo]:
         for record in read_flight(path):
             height_m = float(record.map_from_camera.translation[2])
             yield _Photo(
-                record.path, record.image, lambda _, camera=record.camera: camera, record.ned_from_body,
-                math.nan, height_m, record.map_from_camera,
+                record.path, record.image, record.camera, record.ned_from_body, math.nan, height_m,
+                record.map_from_camera,
             )  # fmt: skip
         return
     if args.intrinsics is None:
@@ -140,7 +141,7 @@ def _photos(path: Path, args: argparse.Namespace) -> Iterator[_Photo]:
     yield _Photo(
         path,
         lambda: read_image(path),
-        lambda image: read_intrinsics(args.intrinsics, image.shape[1], image.shape[0]),
+        None,
         rotation.from_euler(*np.radians(args.attitude or (0.0, 0.0, 0.0))),
         math.nan if args.agl is None else args.agl,
         math.nan if args.height is None else args.height,
@@ -152,7 +153,7 @@ def _answer(
 ) -> bool:
     """Print what a photo comes to; whether that is a fix."""
     image = photo.image()
-    camera = photo.camera(image)
+    camera = photo.camera or read_intrinsics(args.intrinsics, image.shape[1], image.shape[0])
     searcher = _searcher(photo, camera, store, searchers, args)
     georeference = store.pack.georeference
     west, south, east, north = searcher.field.grid.bounds
@@ -199,8 +200,8 @@ def _searcher(
         pixels = (bounds[2] - bounds[0]) * (bounds[3] - bounds[1]) / grid.gsd_m**2
         if pixels > _MAX_FIELD_PX:
             raise MapError(
-                f"{photo.path.name}: taken from {above_m:.0f} m, it must be looked for at {grid.gsd_m:g} m per pixel, which "
-                f"are {pixels / 1e6:.0f} million pixels here, {_MAX_FIELD_PX / 1e6:.0f} are allowed; give --within"
+                f"{photo.path.name}: taken from {above_m:.0f} m, it must be looked for at {grid.gsd_m:g} m per pixel, "
+                f"{pixels / 1e6:.0f} million pixels here, and {_MAX_FIELD_PX / 1e6:.0f} are allowed; give --within"
             )
         start = time.monotonic()
         field = CoarseField.of(store, level, args.within)

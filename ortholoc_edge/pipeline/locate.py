@@ -91,10 +91,11 @@ def locate(
             late = Rejected(frame.stamp_ns, Reason.LATE, f"{len(tried)} of {len(candidates)} places were looked at")
             return Located(late, candidates, tried, 0.0)
         tried.append(localizer.localize(frame, _prior(candidate, sighting, searcher)))
-    return _judged(frame, candidates, tried, options)
+    return judged(frame.stamp_ns, candidates, tried, options)
 
 
-def _judged(frame: Frame, candidates: list[Candidate], tried: list[Outcome], options: LocateOptions) -> Located:
+def judged(stamp_ns: int, candidates: list[Candidate], tried: list[Outcome], options: LocateOptions) -> Located:
+    """What the localizer said of the first candidates, at least of one, put together."""
     fixes = [(place, outcome) for place, outcome in zip(candidates, tried, strict=False) if isinstance(outcome, Fix)]
     if not fixes:
         first = tried[0]
@@ -106,14 +107,14 @@ def _judged(frame: Frame, candidates: list[Candidate], tried: list[Outcome], opt
     for _, other in fixes[1:]:
         if _apart_m(fix, other) > apart_m:
             why = Rejected(
-                frame.stamp_ns, Reason.AMBIGUOUS, "another place fits too, m away", _apart_m(fix, other), apart_m
+                stamp_ns, Reason.AMBIGUOUS, "another place fits too, m away", _apart_m(fix, other), apart_m
             )
             return Located(why, candidates, tried, 0.0)
     others = [place.score for place in candidates if place.distance_m(meant) > 2.0 * apart_m]
     lead = meant.score / max(others) if others else math.inf
     if lead < options.min_lead:
         why = Rejected(
-            frame.stamp_ns, Reason.AMBIGUOUS, "fit of the place over that of the best other", lead, options.min_lead
+            stamp_ns, Reason.AMBIGUOUS, "fit of the place over that of the best other", lead, options.min_lead
         )
         return Located(why, candidates, tried, lead)
     return Located(fix, candidates, tried, lead)

@@ -27,7 +27,7 @@ from ortholoc_edge.tiles.coarse import MEAN_PX, CoarseField
 # Turn of a frame from one heading tried to the next: what a frame of 60 to 110 px bears to either side of it.
 _TURN_RAD: Final = math.radians(4.0)
 # And from one height to the next, as a factor.
-_ZOOM: Final = 1.09
+_ZOOM: Final = 1.14
 # Side of the blocks that are transformed. Larger ones waste less on their rims, and more of the cache.
 _BLOCK_PX: Final = 1024
 _MAX_CANVAS_PX: Final = 256
@@ -37,7 +37,8 @@ _ENOUGH_PX: Final = 56
 # Places closer than this are the same, px.
 _APART_PX: Final = 8
 _PER_BLOCK: Final = 8
-# Beyond this the heading is looked for at half the scale first, and so many of the places found there at full scale.
+# Beyond this heading, or with a barometer's height, frames are looked for at half the scale first, and again at full
+# scale at so many of the places found there.
 _NARROW_RAD: Final = math.radians(25.0)
 _LOOKED_AT: Final = 150
 _SMALL_BLOCK_PX: Final = 256
@@ -141,7 +142,7 @@ class Searcher:
             count: of places.
         Returns: an empty list where the frame shows too little ground for the field's pixels, or has no edges.
         """
-        if sighting.heading_reach_rad <= _NARROW_RAD:
+        if sighting.heading_reach_rad <= _NARROW_RAD and math.isfinite(sighting.above_ground_m):
             found = self._everywhere(sighting, _Scale(self.field, 1, _TURN_RAD, _BLOCK_PX))
         else:
             # At half the scale, in steps twice as wide, an eighth of the work; whatever is promising there is looked at
@@ -174,7 +175,7 @@ class Searcher:
         """The best place around one that was found at half the scale, at full scale."""
         scale = _Scale(self.field, 1, _TURN_RAD, _SMALL_BLOCK_PX)
         side = 4 * _APART_PX
-        if _SMALL_BLOCK_PX < side + 2 * _margin_px(sighting, scale):
+        if side + 2 * _margin_px(sighting, scale) > _SMALL_BLOCK_PX:
             scale = replace(scale, block_px=_BLOCK_PX)
         column, row = np.round(self.field.grid.px_from_map((place.easting_m, place.northing_m))).astype(int).tolist()
         block = _Block(column - side // 2, row - side // 2, side)
@@ -296,7 +297,7 @@ def _steps(sighting: Sighting, field: CoarseField, block: _Block) -> Iterator[tu
     above = sighting.height_m - ground[np.isfinite(ground)]
     steps = np.unique(np.round(np.log(above[above > 1.0]) / math.log(_ZOOM)).astype(int))
     for step in steps.tolist():
-        yield step, (sighting.height_m - _ZOOM ** (step + 0.75), sighting.height_m - _ZOOM ** (step - 0.75))
+        yield step, (sighting.height_m - _ZOOM ** (step + 0.6), sighting.height_m - _ZOOM ** (step - 0.6))
 
 
 def _margin_px(sighting: Sighting, scale: _Scale) -> int:
@@ -328,7 +329,7 @@ def _search_block(scale: _Scale, block: _Block, templates: Sequence[_Template], 
     which = np.zeros(best.shape, np.int16)
     for number, template in enumerate(templates):
         product = cv2.mulSpectrums(spectra[0], template.spectra[0], 0, conjB=True)
-        product += cv2.mulSpectrums(spectra[1], template.spectra[1], 0, conjB=True)
+        cv2.add(product, cv2.mulSpectrums(spectra[1], template.spectra[1], 0, conjB=True), dst=product)
         correlation = cv2.dft(product, flags=cv2.DFT_INVERSE | cv2.DFT_REAL_OUTPUT | cv2.DFT_SCALE)
         x, y = template.foot_px
         # The correlation is for the canvas' corner: the camera is at its foot.

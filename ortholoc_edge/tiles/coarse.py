@@ -1,4 +1,4 @@
-"""The map's edge directions at a coarse scale, all of it in memory: what a frame without a position is looked for in."""
+"""The map's edge directions at a coarse scale, all in memory: what a frame without a position is looked for in."""
 
 from __future__ import annotations
 
