@@ -39,11 +39,13 @@ class LocateOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     ``candidates``: of the search, that are looked at closely.
     ``near_best``: part of the best one's score, below which a candidate is not.
     ``min_lead``: score of the place that is right over that of the best other one, at least.
+    ``sure_lead``: where the best one has that much over the next and is right, no other is looked at.
     """
 
     candidates: Annotated[int, Meta(ge=1, le=100)] = 5
     near_best: Annotated[float, Meta(ge=0, le=1)] = 0.6
     min_lead: Annotated[float, Meta(ge=0)] = 1.05
+    sure_lead: Annotated[float, Meta(ge=1)] = 1.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,6 +93,9 @@ def locate(
             late = Rejected(frame.stamp_ns, Reason.LATE, f"{len(tried)} of {len(candidates)} places were looked at")
             return Located(late, candidates, tried, 0.0)
         tried.append(localizer.localize(frame, _prior(candidate, sighting, searcher)))
+        alone = len(candidates) == 1 or candidates[0].score >= options.sure_lead * candidates[1].score
+        if alone and isinstance(tried[0], Fix):
+            break
     return judged(frame.stamp_ns, candidates, tried, options)
 
 

@@ -179,10 +179,15 @@ class Searcher:
             scale = replace(scale, block_px=_BLOCK_PX)
         column, row = np.round(self.field.grid.px_from_map((place.easting_m, place.northing_m))).astype(int).tolist()
         block = _Block(column - side // 2, row - side // 2, side)
+        above_m = place.above_ground_m
+        if not math.isfinite(sighting.above_ground_m):
+            # Here it is known better than to a step.
+            ground_m = float(self.field.ground_m(np.array([[place.easting_m, place.northing_m]]))[0])
+            above_m = sighting.height_m - ground_m if math.isfinite(ground_m) else above_m
         templates = [
             template
             for turn_rad in (place.turn_rad - _TURN_RAD, place.turn_rad, place.turn_rad + _TURN_RAD)
-            if (template := _template(sighting, scale, place.above_ground_m, turn_rad)) is not None
+            if (template := _template(sighting, scale, above_m, turn_rad)) is not None
         ]
         return _search_block(scale, block, templates, 1) if templates else []
 

@@ -102,7 +102,7 @@ def test_a_barometer_counts_from_the_ground_below(searcher: Searcher) -> None:
         known = Sighting(seen(place, turn, above_m), CAMERA, turn, math.radians(5.0), math.nan, 300.0)
         found = searcher.search(known)
         assert away_m(found[0], place) < 2.5 * GSD_M
-        assert found[0].above_ground_m == pytest.approx(above_m, rel=0.06)
+        assert found[0].above_ground_m == pytest.approx(above_m, rel=0.01)
 
 
 def test_at_the_maps_rim(searcher: Searcher) -> None:
