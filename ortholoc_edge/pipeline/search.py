@@ -41,7 +41,6 @@ _PER_BLOCK: Final = 8
 # scale at so many of the places found there.
 _NARROW_RAD: Final = math.radians(25.0)
 _LOOKED_AT: Final = 150
-_SMALL_BLOCK_PX: Final = 256
 # Templates of a block are held in memory at a time: 8 MB each at 1024 px.
 _AT_A_TIME: Final = 12
 # Of the map's mean energy: where there is less, a frame that fits well does so by chance.
@@ -173,22 +172,20 @@ class Searcher:
 
     def _near(self, sighting: Sighting, place: Candidate) -> list[Candidate]:
         """The best place around one that was found at half the scale, at full scale."""
-        scale = _Scale(self.field, 1, _TURN_RAD, _SMALL_BLOCK_PX)
-        side = 4 * _APART_PX
-        if side + 2 * _margin_px(sighting, scale) > _SMALL_BLOCK_PX:
-            scale = replace(scale, block_px=_BLOCK_PX)
         column, row = np.round(self.field.grid.px_from_map((place.easting_m, place.northing_m))).astype(int).tolist()
-        block = _Block(column - side // 2, row - side // 2, side)
-        above_m = place.above_ground_m
+        above_m, side = place.above_ground_m, 4 * _APART_PX
         if not math.isfinite(sighting.above_ground_m):
             # Here it is known better than to a step.
             ground_m = float(self.field.ground_m(np.array([[place.easting_m, place.northing_m]]))[0])
             above_m = sighting.height_m - ground_m if math.isfinite(ground_m) else above_m
+        needed_px = side + 2 * _margin_px(replace(sighting, above_ground_m=above_m), self.field, 1)
+        scale = _Scale(self.field, 1, _TURN_RAD, 2 * cv2.getOptimalDFTSize(-(-needed_px // 2)))
         templates = [
             template
             for turn_rad in (place.turn_rad - _TURN_RAD, place.turn_rad, place.turn_rad + _TURN_RAD)
             if (template := _template(sighting, scale, above_m, turn_rad)) is not None
         ]
+        block = _Block(column - side // 2, row - side // 2, side)
         return _search_block(scale, block, templates, 1) if templates else []
 
 
@@ -275,7 +272,7 @@ class _Block:
 def _heights(sighting: Sighting, scale: _Scale) -> Iterator[tuple[float, list[_Block]]]:
     """Heights above ground to look from, and the blocks of the map that each holds in."""
     # A camera of a block needs the ground around it, up to half a canvas and more where it looks aslant.
-    field, side = scale.field, scale.block_px - 2 * _margin_px(sighting, scale)
+    field, side = scale.field, scale.block_px - 2 * _margin_px(sighting, scale.field, scale.halving)
     if side < scale.block_px // 4:
         return
     blocks = [
@@ -305,10 +302,9 @@ def _steps(sighting: Sighting, field: CoarseField, block: _Block) -> Iterator[tu
         yield step, (sighting.height_m - _ZOOM ** (step + 0.6), sighting.height_m - _ZOOM ** (step - 0.6))
 
 
-def _margin_px(sighting: Sighting, scale: _Scale) -> int:
+def _margin_px(sighting: Sighting, field: CoarseField, halving: int) -> int:
     """Pixels around a camera that its frame may show."""
-    camera, field = sighting.camera, scale.field
-    gsd_m = field.grid.gsd_m
+    camera, gsd_m = sighting.camera, field.grid.gsd_m
     above_m = sighting.above_ground_m
     if not math.isfinite(above_m):
         lowest = float(np.nanmin(field.ground)) if np.isfinite(field.ground).any() else 0.0
@@ -317,7 +313,7 @@ def _margin_px(sighting: Sighting, scale: _Scale) -> int:
     rays = camera.unproject(corners) @ sighting.map_from_camera.T
     slope = np.hypot(rays[:, 0], rays[:, 1]) / np.maximum(-rays[:, 2], 0.25)
     reach = (1.0 + sighting.height_reach) * above_m * float(np.nan_to_num(slope, nan=4.0).max()) / gsd_m
-    return min(math.ceil(reach) + 3, _MAX_CANVAS_PX // scale.halving)
+    return min(math.ceil(reach) + 3, _MAX_CANVAS_PX // halving)
 
 
 def _search_block(scale: _Scale, block: _Block, templates: Sequence[_Template], count: int) -> list[Candidate]:
