@@ -110,6 +110,34 @@ class _Template:
     pixels: int
 
 
+def agreeing(
+    frames: Sequence[Sequence[Candidate]], moved_m: Sequence[FloatArray], apart_m: float, count: int = 20
+) -> list[Candidate]:
+    """Candidates of several frames put together by how the vehicle moved between them: where a field or a street
+    pattern looks like another the sequence decides.
+
+    Args:
+        frames: candidates of each, the latest last.
+        moved_m: (2,) east and north from each frame to the next, one less than there are frames.
+        apart_m: what a frame's place and the motion may be off together, up to the latest frame.
+    Returns: places of the latest frame, the best first; the score is the mean over the frames, and a frame that has
+    nothing near counts with its worst candidate's.
+    """
+    after = [np.sum(np.reshape(moved_m[k:], (-1, 2)), axis=0) for k in range(len(frames))]
+    now = [
+        [replace(one, easting_m=one.easting_m + float(x), northing_m=one.northing_m + float(y)) for one in found]
+        for found, (x, y) in zip(frames, after, strict=True)
+    ]
+    together = []
+    for place in (one for found in now for one in found):
+        scores = []
+        for found in now:
+            near = [one.score for one in found if one.distance_m(place) <= apart_m]
+            scores.append(max(near) if near else min((one.score for one in found), default=0.0))
+        together.append(replace(place, score=float(np.mean(scores))))
+    return distinct(together, apart_m, count)
+
+
 def fitting_level(grids: Sequence[RasterGrid], camera: Camera, above_ground_m: float) -> int:
     """Of the levels of an orthophoto, finest first: the coarsest at which a frame taken straight down shows enough; the
     finest if none is."""

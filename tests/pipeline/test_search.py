@@ -15,7 +15,7 @@ from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.grid import RasterGrid
 from ortholoc_edge.matching.orientation import orientation_field
-from ortholoc_edge.pipeline.search import Candidate, Searcher, Sighting, distinct, fitting_level
+from ortholoc_edge.pipeline.search import Candidate, Searcher, Sighting, agreeing, distinct, fitting_level
 from ortholoc_edge.tiles.coarse import MEAN_PX, CoarseField
 
 CAMERA = Camera.from_focal(320, 240, 270.0)
@@ -144,6 +144,30 @@ def test_distinct_keeps_the_best_of_each_place() -> None:
     places = [Candidate(x, 0.0, 100.0, 0.0, score) for x, score in ((0.0, 0.5), (3.0, 0.6), (40.0, 0.4), (44.0, 0.3))]
     assert [(one.easting_m, one.score) for one in distinct(places, 10.0, 5)] == [(3.0, 0.6), (40.0, 0.4)]
     assert len(distinct(places, 10.0, 1)) == 1
+
+
+def test_a_sequence_decides_what_a_frame_can_not() -> None:
+    """Each frame likes a wrong place best; but only the right ones lie as the vehicle moved."""
+
+    def places(*known: tuple[float, float, float]) -> list[Candidate]:
+        return [Candidate(x, y, 100.0, 0.0, score) for x, y, score in (*known, (-7000.0, 300.0 * known[0][0], 0.2))]
+
+    first = places((0.0, 0.0, 0.31), (500.0, 80.0, 0.29))
+    second = places((900.0, 900.0, 0.30), (540.0, 52.0, 0.28))
+    moved = np.array([42.0, -30.0])
+    found = agreeing([first, second], [moved], 8.0)
+    assert (found[0].easting_m, found[0].northing_m) == pytest.approx((540.0, 52.0), abs=3.0)
+    assert found[0].score == pytest.approx((0.29 + 0.28) / 2)
+    # A place of one frame alone has the other's worst for company.
+    assert found[1].score == pytest.approx((0.31 + 0.2) / 2)
+    # Moved the other way, nothing agrees.
+    assert agreeing([first, second], [-moved], 8.0)[0].score == pytest.approx((0.31 + 0.2) / 2)
+    assert agreeing([second], [], 8.0) == second
+    # Three frames, the middle one blind.
+    third = places((545.0, 100.0, 0.3))
+    [best, *_] = agreeing([first, [], third], [moved, np.array([5.0, 48.0])], 8.0)
+    assert best.northing_m == pytest.approx(100.0, abs=3.0)
+    assert best.score == pytest.approx((0.29 + 0.3) / 3)
 
 
 def test_level_that_suits_a_height() -> None:
