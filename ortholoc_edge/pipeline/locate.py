@@ -92,7 +92,11 @@ def locate(
         if not proceed():
             late = Rejected(frame.stamp_ns, Reason.LATE, f"{len(tried)} of {len(candidates)} places were looked at")
             return Located(late, candidates, tried, 0.0)
-        tried.append(localizer.localize(frame, _prior(candidate, sighting, searcher)))
+        prior = _prior(candidate, sighting, searcher)
+        if prior is None:
+            tried.append(Rejected(frame.stamp_ns, Reason.MAP_NODATA, "the surface model has no data there"))
+            continue
+        tried.append(localizer.localize(frame, prior))
         alone = len(candidates) == 1 or candidates[0].score >= options.sure_lead * candidates[1].score
         if alone and isinstance(tried[0], Fix):
             break
@@ -129,11 +133,14 @@ def _apart_m(fix: Fix, other: Fix) -> float:
     return float(np.linalg.norm(fix.map_from_camera.translation[:2] - other.map_from_camera.translation[:2]))
 
 
-def _prior(candidate: Candidate, sighting: Sighting, searcher: Searcher) -> PosePrior:
+def _prior(candidate: Candidate, sighting: Sighting, searcher: Searcher) -> PosePrior | None:
+    """None where the ground's height is not known."""
     above_m, place = candidate.above_ground_m, np.array([candidate.easting_m, candidate.northing_m])
     height_m = sighting.height_m
     if not math.isfinite(height_m):
-        height_m = float(np.nan_to_num(searcher.field.ground_m(place[None])[0])) + above_m
+        height_m = float(searcher.field.ground_m(place[None])[0]) + above_m
+    if not math.isfinite(height_m):
+        return None
     turned = rotation.exp([0.0, 0.0, candidate.turn_rad]) @ sighting.map_from_camera
     place_m = math.hypot(_PLACE_SIGMA_PX * searcher.field.grid.gsd_m, _TILT_SIGMA_RAD * above_m)
     height_sigma_m = _HEIGHT_SIGMA * above_m
