@@ -28,8 +28,9 @@ from ortholoc_edge.tiles.coarse import MEAN_PX, CoarseField
 _TURN_RAD: Final = math.radians(4.0)
 # And from one height to the next, as a factor.
 _ZOOM: Final = 1.14
-# Side of the blocks that are transformed. Larger ones waste less on their rims, and more of the cache.
-_BLOCK_PX: Final = 1024
+# Least side of the blocks that are transformed. Of 1024 px less is wasted on the rims, but a third more time is needed,
+# since they do not fit the cache, and 100 MB instead of 4.
+_BLOCK_PX: Final = 512
 _MAX_CANVAS_PX: Final = 256
 # A frame with less to see than this is not looked for, px; and from so many on its edges tell it from others.
 _MIN_CANVAS_PX: Final = 24
@@ -41,7 +42,7 @@ _PER_BLOCK: Final = 8
 # scale at so many of the places found there.
 _NARROW_RAD: Final = math.radians(25.0)
 _LOOKED_AT: Final = 150
-# Templates of a block are held in memory at a time: 8 MB each at 1024 px.
+# Templates of a block are held in memory at a time: 2 MB each at 512 px.
 _AT_A_TIME: Final = 12
 # Of the map's mean energy: where there is less, a frame that fits well does so by chance.
 _LEAST_ENERGY: Final = 0.3
@@ -170,11 +171,11 @@ class Searcher:
         Returns: an empty list where the frame shows too little ground for the field's pixels, or has no edges.
         """
         if sighting.heading_reach_rad <= _NARROW_RAD and math.isfinite(sighting.above_ground_m):
-            found = self._everywhere(sighting, _Scale(self.field, 1, _TURN_RAD, _BLOCK_PX))
+            found = self._everywhere(sighting, _scale(sighting, self.field, 1))
         else:
             # At half the scale, in steps twice as wide, an eighth of the work; whatever is promising there is looked at
             # again.
-            rough = self._everywhere(sighting, _Scale(self._half, 2, 2.0 * _TURN_RAD, _BLOCK_PX // 2))
+            rough = self._everywhere(sighting, _scale(sighting, self._half, 2))
             apart_m = _APART_PX * self.field.grid.gsd_m
             again = [self._pool.submit(self._near, sighting, place) for place in distinct(rough, apart_m, _LOOKED_AT)]
             found = [candidate for future in again for candidate in future.result()]
@@ -226,6 +227,13 @@ class _Scale:
     halving: int
     turn_rad: float
     block_px: int
+
+
+def _scale(sighting: Sighting, field: CoarseField, halving: int) -> _Scale:
+    """With blocks of which a third or more is their inside."""
+    margin_px = _margin_px(sighting, field, halving)
+    block_px = max(_BLOCK_PX // halving, 2 * cv2.getOptimalDFTSize(-(-3 * margin_px // 2)))
+    return _Scale(field, halving, halving * _TURN_RAD, block_px)
 
 
 def distinct(found: Sequence[Candidate], apart_m: float, count: int) -> list[Candidate]:
@@ -301,8 +309,6 @@ def _heights(sighting: Sighting, scale: _Scale) -> Iterator[tuple[float, list[_B
     """Heights above ground to look from, and the blocks of the map that each holds in."""
     # A camera of a block needs the ground around it, up to half a canvas and more where it looks aslant.
     field, side = scale.field, scale.block_px - 2 * _margin_px(sighting, scale.field, scale.halving)
-    if side < scale.block_px // 4:
-        return
     blocks = [
         _Block(column, row, side)
         for row in range(0, field.grid.height, side)

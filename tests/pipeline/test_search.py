@@ -117,7 +117,7 @@ def test_blocks_hide_nothing_at_their_seams(monkeypatch: pytest.MonkeyPatch) -> 
     turn = turned_down(0.0, 10.0)
     sighting = Sighting(seen(PLACE, turn, ABOVE_M), CAMERA, turn, math.radians(3.0), ABOVE_M)
     places = []
-    for side in (512, 256):
+    for side in (700, 256):
         monkeypatch.setattr("ortholoc_edge.pipeline.search._BLOCK_PX", side)
         places.append(Searcher(field(), threads=2).search(sighting, 3))
     assert all(one.distance_m(other) == 0.0 for one, other in zip(*places, strict=True))
