@@ -17,9 +17,9 @@ EXIT_CONFIG = 78  # EX_CONFIG: systemd's RestartPreventExitStatus, a restart can
 
 # Each in the module of its name.
 _COMMANDS = (
-    "sim", "run", "doctor", "bus", "check-config", "install-service", "replay", "localize", "calibrate",
-    "calibrate-flight", "calibrate-focal", "convert-calibration", "tiles", "models", "samples", "bench", "bench-replay",
-    "bench-core", "bench-link", "bench-bus", "bench-packs", "bench-service", "bench-start", "profile",
+    "sim", "run", "doctor", "bus", "check-config", "install-service", "replay", "localize", "locate",
+    "calibrate", "calibrate-flight", "calibrate-focal", "convert-calibration", "tiles", "models", "samples", "bench",
+    "bench-replay", "bench-core", "bench-link", "bench-bus", "bench-packs", "bench-service", "bench-start", "profile",
 )  # fmt: skip
 
 

@@ -129,7 +129,7 @@ def run(args: argparse.Namespace) -> int:
         finally:
             localizer.close()
         if args.overlay is not None:
-            caption = f"{args.image.name}: " + _sentence(outcome, store.pack.georeference)[0]
+            caption = f"{args.image.name}: " + sentence(outcome, store.pack.georeference)[0]
             draw.write_png(args.overlay, draw.overlay(image, outcome, None, camera, caption))
         return _answer(args, outcome, store.pack.georeference)
 
@@ -180,14 +180,14 @@ def _answer(args: argparse.Namespace, outcome: Outcome, georeference: Georeferen
     if args.json:
         record = outcome_record(outcome)
         if isinstance(outcome, Fix) and georeference is not None:
-            record |= _georeferenced(outcome, georeference)
+            record |= georeferenced(outcome, georeference)
         print(json.dumps(record))
     else:
-        print("\n".join(_sentence(outcome, georeference)))
+        print("\n".join(sentence(outcome, georeference)))
     return 0 if isinstance(outcome, Fix) else 1
 
 
-def _georeferenced(fix: Fix, georeference: Georeference) -> dict[str, Any]:
+def georeferenced(fix: Fix, georeference: Georeference) -> dict[str, Any]:
     """Attitude from true north, and WGS 84 where the pack has a reference system."""
     position = fix.map_from_camera.translation
     map_from_ned = frames.map_from_ned_rotation(georeference.convergence_rad(position[:2]))
@@ -205,7 +205,7 @@ def _georeferenced(fix: Fix, georeference: Georeference) -> dict[str, Any]:
     return record
 
 
-def _sentence(outcome: Outcome, georeference: Georeference | None) -> list[str]:
+def sentence(outcome: Outcome, georeference: Georeference | None) -> list[str]:
     if not isinstance(outcome, Fix):
         limit = "" if outcome.limit is None else f" ({outcome.measured:.3g}, limit {outcome.limit:.3g})"
         return [f"no fix: {outcome.reason}: {outcome.detail}{limit}"]
@@ -218,7 +218,7 @@ def _sentence(outcome: Outcome, georeference: Georeference | None) -> list[str]:
     if outcome.focal_sigma_px is not None:
         lines.append(f"focal length {outcome.camera.focal_px:.1f} px, 1-sigma {outcome.focal_sigma_px:.1f} px")
     if georeference is not None:
-        known = _georeferenced(outcome, georeference)
+        known = georeferenced(outcome, georeference)
         roll, pitch, yaw = known["attitude_rpy_true_north_deg"]
         lines.append(f"body roll {roll:.2f} pitch {pitch:.2f} yaw {yaw:.2f} deg from true north")
         if "latitude_deg" in known:

@@ -29,12 +29,16 @@ _NOISE: Final = 4.0
 _RIM: Final = np.ones((5, 5), np.uint8)
 
 
-def orientation_field(image: ImageArray, valid: BoolArray | None = None) -> Float32Array:
+def orientation_field(
+    image: ImageArray, valid: BoolArray | None = None, mean_px: float | None = None
+) -> Float32Array:
     """Field of edge directions.
 
     Args:
         image: (H, W) uint8 grey.
         valid: (H, W); None: everywhere. The field is 0 at and beside where it is False.
+        mean_px: side of the box whose mean is taken off; None: a third of the long side, as for two pictures of one
+            view. Pictures of different sizes are alike only with the same.
     Returns: (2, H, W) float32: real and imaginary part, of about unit length at edges.
     """
     x = cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=3)
@@ -58,7 +62,7 @@ def orientation_field(image: ImageArray, valid: BoolArray | None = None) -> Floa
     around = _around(strength)
     for k in range(2):
         cv2.divide(cv2.GaussianBlur(field[k], (7, 7), _SMOOTHING_PX), around, dst=field[k])
-    _subtract_local_mean(field, inner)
+    _subtract_local_mean(field, inner, max(image.shape) * _MEAN_PART if mean_px is None else mean_px)
     return field
 
 
@@ -74,12 +78,12 @@ def _around(strength: Float32Array) -> Float32Array:
     return around
 
 
-def _subtract_local_mean(field: Float32Array, inner: Float32Array | None) -> None:
+def _subtract_local_mean(field: Float32Array, inner: Float32Array | None, mean_px: float) -> None:
     """In place, and 0 where ``inner`` is."""
     rows, columns = field.shape[1:]
     # The mean is smooth: a fraction of the pixels tells it.
     size = max(columns // _MEAN_SHRINK, 1), max(rows // _MEAN_SHRINK, 1)
-    side = max(round(max(size) * _MEAN_PART), 1)
+    side = max(round(max(size) / max(rows, columns) * mean_px), 1)
     weight = 1.0 if inner is None else np.maximum(_box(inner, size, side), np.float32(1e-3))
     for k in range(2):
         mean = _box(field[k] if inner is None else field[k] * inner, size, side) / weight

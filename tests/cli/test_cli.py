@@ -66,9 +66,9 @@ def position(truth: Rigid3 = TRUTH, off_m: tuple[float, float, float] = (3.0, -2
 # -- help and errors ---------------------------------------------------------
 
 HELP = [
-    ["sim"], ["run"], ["doctor"], ["replay"], ["localize"], ["bench"], ["bench-replay"], ["models", "build"],
-    ["models", "list"], ["tiles", "build"], ["tiles", "info"], ["tiles", "verify"], ["samples", "make"],
-    ["samples", "simulate"], ["samples", "draw"], ["profile"],
+    ["sim"], ["run"], ["doctor"], ["replay"], ["localize"], ["locate"], ["bench"], ["bench-replay"],
+    ["models", "build"], ["models", "list"], ["tiles", "build"], ["tiles", "info"], ["tiles", "verify"],
+    ["samples", "make"], ["samples", "simulate"], ["samples", "draw"], ["profile"],
 ]  # fmt: skip
 # Their only arguments are required, or there are none.
 WITHOUT_DEFAULTS = ("run", "tiles verify", "samples draw")

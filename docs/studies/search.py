@@ -1,0 +1,343 @@
+"""How often, and in what time, a frame is found in a whole map of which nothing is known but attitude and height
+(search.md).
+
+    python docs/studies/search.py frames PACK OUT.npz --look 2019 --count 40 --agl 120 --seed 2
+    python docs/studies/search.py find PACK OUT.npz --heading 10 --height barometer
+    python docs/studies/search.py find PACK OUT.npz --hostile mirrored         where nothing may be found; or: absent
+    python docs/studies/search.py others PACK OUT.npz                          SIFT with votes, and VLAD
+
+PACK is of the simulation's endless country (`ortholoc_sim.country`). What is known of a frame is off by 0.7 deg of tilt
+and 3 % of the height above ground (1-sigma), and by up to ``--heading`` degrees.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ortholoc_edge.geometry import frames, rotation
+from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
+from ortholoc_edge.geometry.camera import Camera
+from ortholoc_edge.geometry.rigid import Rigid3
+from ortholoc_edge.matching.types import Structural
+from ortholoc_edge.pipeline.frame import Frame
+from ortholoc_edge.pipeline.locate import locate
+from ortholoc_edge.pipeline.localizer import Localizer, LocalizerOptions
+from ortholoc_edge.pipeline.outcome import Fix
+from ortholoc_edge.pipeline.rectify import rectified
+from ortholoc_edge.pipeline.search import Searcher, Sighting, fitting_level
+from ortholoc_edge.tiles.coarse import CoarseField
+from ortholoc_edge.tiles.pack import Pack
+from ortholoc_edge.tiles.store import MapStore
+from ortholoc_sim.camera import Sensor
+from ortholoc_sim.country import FLIGHT, SURVEYS, Country
+from ortholoc_sim.wide import WideRenderer
+
+CAMERA = Camera.from_focal(640, 480, 540.0)
+TILT_SIGMA_RAD, HEIGHT_SIGMA, FLOWN_TILT_SIGMA_RAD = math.radians(0.7), 0.03, math.radians(4.0)
+# A candidate this near is right, and a fix this near.
+NEAR_M, RIGHT_M = 12.0, 3.0
+GONE_M = 240.0
+RANKS = (1, 5, 20)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Case:
+    """A frame with its true pose and the ground below it."""
+
+    image: ImageArray
+    pose: Rigid3
+    ground_m: float
+
+
+def make(args: argparse.Namespace) -> None:
+    """Frames at random places and headings, drawn as the simulation's camera sees them."""
+    store = MapStore(Pack.open(args.pack))
+    look = FLIGHT if args.look == "flight" else SURVEYS[int(args.look)]
+    rng, country, sensor, made = np.random.default_rng(args.seed), Country(), Sensor(), []
+    west, south, east, north = store.bounds
+    while len(made) < args.count:
+        place = rng.uniform((west + 120.0, south + 120.0), (east - 120.0, north - 120.0))
+        around = np.stack(np.meshgrid([-100.0, 0.0, 100.0], [-100.0, 0.0, 100.0]), axis=-1).reshape(-1, 2)
+        ground = store.heights(place + around, 4.0)
+        if not np.isfinite(ground).all():
+            continue
+        yaw = rng.uniform(0.0, 2.0 * math.pi)
+        tilts = np.clip(rng.normal(0.0, FLOWN_TILT_SIGMA_RAD, 2), -0.2, 0.2)
+        turn = frames.ENU_FROM_NED @ rotation.from_euler(*tilts, yaw) @ frames.BODY_FROM_NADIR_CAMERA
+        pose = Rigid3(turn, np.append(place, ground[4] + args.agl))
+        renderer = WideRenderer(
+            country, store.pack.manifest.crs, look, sensor, ground_m=float(np.median(ground)), grid_scale=1.0,
+            texel_m=0.2,
+        )  # fmt: skip
+        image = sensor.expose(renderer.clean(CAMERA, pose), CAMERA, len(made))
+        made.append((image, turn, pose.translation, ground[4]))
+    images, turns, places, grounds = (np.array(part) for part in zip(*made, strict=True))
+    np.savez_compressed(args.out, images=images, turns=turns, places=places, grounds=grounds)
+
+
+def cases(path: Path) -> Iterator[Case]:
+    with np.load(path) as data:
+        parts = [data[key] for key in ("images", "turns", "places", "grounds")]
+    for image, turn, place, ground in zip(*parts, strict=True):
+        yield Case(image, Rigid3(turn, place), float(ground))
+
+
+def sightings(path: Path, heading_deg: float, barometer: bool) -> Iterator[tuple[Case, Sighting]]:
+    """Each frame and what is known of it."""
+    rng = np.random.default_rng(7)
+    for case in cases(path):
+        off = rng.uniform(-1.0, 1.0) * math.radians(heading_deg)
+        tilt = rotation.exp([*rng.normal(0.0, TILT_SIGMA_RAD, 2), 0.0])
+        above_m = float(case.pose.translation[2]) - case.ground_m
+        wrong_m = float(rng.normal(0.0, HEIGHT_SIGMA)) * above_m
+        known = Sighting(
+            np.asarray(cv2.cvtColor(case.image, cv2.COLOR_RGB2GRAY), dtype=np.uint8),
+            CAMERA,
+            rotation.exp([0.0, 0.0, off]) @ tilt @ case.pose.rotation,
+            math.radians(heading_deg),
+            math.nan if barometer else above_m + wrong_m,
+            float(case.pose.translation[2]) + wrong_m if barometer else math.nan,
+        )
+        yield case, known
+
+
+def find(args: argparse.Namespace) -> None:
+    store = MapStore(Pack.open(args.pack))
+    level = fitting_level(store.dop_grids, CAMERA, args.agl)
+    began = time.process_time()
+    field = CoarseField.of(store, level)
+    made_s = time.process_time() - began
+    print(f"{field.known_km2:.1f} km2, {field.grid.gsd_m:g} m, {field.bytes / 1e6:.1f} MB, {made_s:.1f} s CPU")
+    localizer = Localizer(CAMERA, store, Structural(), LocalizerOptions())
+    whole = Searcher(field, args.threads)
+    ranks, right, wrong, cpu_s, wall_s = [], 0, 0, [], []
+    for number, (case, honest) in enumerate(sightings(args.frames, args.heading, args.height == "barometer")):
+        if number == args.count:
+            break
+        image, known, searcher = case.image, honest, whole
+        if args.hostile == "mirrored":
+            image = np.ascontiguousarray(image[:, ::-1])
+            known = replace(honest, grey=np.ascontiguousarray(honest.grey[:, ::-1]))
+        elif args.hostile == "absent":
+            searcher = Searcher(without(field, case.pose.translation[:2]), args.threads)
+        cpu, wall = time.process_time(), time.monotonic()
+        located = locate(Frame(0, image, str(number)), known, searcher, localizer)
+        cpu_s.append(time.process_time() - cpu)
+        wall_s.append(time.monotonic() - wall)
+        place = case.pose.translation
+        away = [math.hypot(one.easting_m - place[0], one.northing_m - place[1]) for one in located.candidates]
+        ranks.append(next((rank for rank, m in enumerate(away) if m < NEAR_M), 999))
+        error_m = math.nan
+        if isinstance(located.outcome, Fix):
+            error_m = float(np.linalg.norm(located.outcome.map_from_camera.translation - place))
+            right += error_m < RIGHT_M
+            wrong += not error_m < RIGHT_M
+        if searcher is not whole:
+            searcher.close()
+        scores = " ".join(f"{one.score:.3f}" for one in located.candidates[:3])
+        print(f"{number}: rank {ranks[-1]}, {scores}, lead {located.lead:.2f}, error {error_m:.2f} m", flush=True)
+    told = ", ".join(f"R@{k} {np.mean(np.array(ranks) < k):.3f}" for k in RANKS)
+    print(
+        f"{len(ranks)} frames: {told}; fixes right {right}, wrong {wrong}; CPU {np.median(cpu_s):.1f} s (worst "
+        f"{max(cpu_s):.1f}), wall {np.median(wall_s):.1f} s"
+    )
+
+
+def without(field: CoarseField, place: FloatArray) -> CoarseField:
+    """The map without the surroundings of a place."""
+    column, row = np.round(field.grid.px_from_map(place)).astype(int)
+    reach = round(GONE_M / field.grid.gsd_m)
+    quantised = field.quantised.copy()
+    quantised[:, max(row - reach, 0) : row + reach, max(column - reach, 0) : column + reach] = 0
+    return replace(field, quantised=quantised)
+
+
+# -- other ways -------------------------------------------------------------------------------------------
+
+# Of the orthophoto at this level; SIFT upright, rooted, one byte a number.
+OTHER_LEVEL, PER_KM2, PER_FRAME, VOTES = 2, 4000, 300, 20
+WORDS, PROJECTED, STEP_M, HALF_M = 32, 24, 40.0, 60.0
+
+
+def sift_of(sift: Any, image: ImageArray, valid: np.ndarray, count: int) -> tuple[FloatArray, np.ndarray]:
+    """Pixels (N, 2) and descriptors (N, 128) uint8 of the strongest, without their turn: all pictures are north-up."""
+    inner = cv2.erode(valid.astype(np.uint8), np.ones((9, 9), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    strongest = sorted(sift.detect(image, inner), key=lambda one: -one.response)[:count]
+    upright = {(round(k.pt[0], 1), round(k.pt[1], 1), k.octave): k for k in strongest}
+    for one in upright.values():
+        one.angle = 0.0
+    kept, raw = sift.compute(image, list(upright.values()))
+    if raw is None:
+        return np.empty((0, 2)), np.empty((0, 128), np.uint8)
+    rooted = np.sqrt(raw / np.maximum(raw.sum(axis=1, keepdims=True), 1e-6))
+    return np.array([one.pt for one in kept]), (rooted * 255).astype(np.uint8)
+
+
+def others(args: argparse.Namespace) -> None:
+    store = MapStore(Pack.open(args.pack), max_pixels=100_000_000)
+    grid, sift, side = store.dop_grids[OTHER_LEVEL], cv2.SIFT_create(contrastThreshold=0.01), 1024
+    began, px_parts, parts = time.process_time(), [], []
+    for row in range(0, grid.height, side):
+        for column in range(0, grid.width, side):
+            piece = grid.crop(column, row, min(side, grid.width - column), min(side, grid.height - row))
+            window = store.read(piece.bounds, grid.gsd_m, math.inf)
+            if window is None or not window.dop_valid.any():
+                continue
+            count = round(PER_KM2 * window.dop_valid.sum() * grid.gsd_m**2 * 1e-6)
+            px, found = sift_of(sift, window.dop_grey, window.dop_valid, count)
+            px_parts.append(px + np.array([column, row]))
+            parts.append(found)
+    px, descriptors = np.concatenate(px_parts), np.concatenate(parts)
+    print(f"SIFT: {len(px)} of the map, {descriptors.nbytes / 1e6:.1f} MB, {time.process_time() - began:.0f} s CPU")
+    began = time.process_time()
+    vlad = Vlad(px * grid.gsd_m, descriptors)
+    made_s = time.process_time() - began
+    print(f"VLAD: {len(vlad.middles_m)} windows, {vlad.bytes / 1e6:.1f} MB, {made_s:.0f} s CPU", flush=True)
+    squares = np.concatenate([np.square(d.astype(np.float32)).sum(axis=1) for d in np.array_split(descriptors, 50)])
+    by_votes, by_vlad, votes_s, vlad_s = [], [], [], []
+    for number, (case, known) in enumerate(sightings(args.frames, args.heading, False)):
+        if number == args.count:
+            break
+        to_ground = np.diag([grid.gsd_m, -grid.gsd_m, -known.above_ground_m])
+        from_grid = CAMERA.matrix @ known.map_from_camera.T @ to_ground
+        seen = rectified(known.grey, CAMERA, from_grid, 10**6)
+        assert seen is not None
+        corner = np.linalg.solve(from_grid, seen.frame_from_canvas)
+        foot = -corner[:2, 2] / corner[2, 2]
+        true = grid.px_from_map(case.pose.translation[:2])
+        cpu = time.process_time()
+        own_px, own = sift_of(sift, seen.image, seen.valid, PER_FRAME)
+        extracted_s = time.process_time() - cpu
+        if len(own) < VOTES:
+            by_votes.append(999)
+            by_vlad.append(999)
+            continue
+        places = voted(own_px - foot, own, px, descriptors, squares)
+        votes_s.append(time.process_time() - cpu)
+        by_votes.append(first(np.linalg.norm(places - true, axis=1) * grid.gsd_m < 20.0))
+        cpu = time.process_time()
+        middles = vlad.nearest(own)
+        vlad_s.append(extracted_s + time.process_time() - cpu)
+        # Windows lie 40 m apart.
+        by_vlad.append(first(np.linalg.norm(middles - true * grid.gsd_m, axis=1) < 60.0))
+    for name, found, cpu_s in (("SIFT, votes", by_votes, votes_s), ("VLAD", by_vlad, vlad_s)):
+        told = ", ".join(f"R@{k} {np.mean(np.array(found) < k):.3f}" for k in RANKS)
+        print(f"{name}: {len(found)} frames, {told}; CPU {np.median(cpu_s):.2f} s")
+
+
+def first(near: np.ndarray) -> int:
+    hits = np.flatnonzero(near)
+    return int(hits[0]) if len(hits) else 999
+
+
+def voted(
+    offsets: FloatArray, own: np.ndarray, px: FloatArray, descriptors: np.ndarray, squares: np.ndarray
+) -> FloatArray:
+    """Pixels (20, 2) where most of the nearest descriptors put the camera."""
+    distance = np.concatenate(
+        [
+            some_squares[None] - 2.0 * own.astype(np.float32) @ some.astype(np.float32).T
+            for some, some_squares in zip(np.array_split(descriptors, 50), np.array_split(squares, 50), strict=True)
+        ],
+        axis=1,
+    )
+    nearest = np.argpartition(distance, VOTES, axis=1)[:, :VOTES]
+    cells = np.floor((px[nearest] - offsets[:, None]).reshape(-1, 2) / 8.0).astype(int)
+    votes = np.zeros(np.ceil(px.max(axis=0) / 8.0).astype(int)[::-1] + 2, np.float32)
+    inside = ((cells >= 0) & (cells < votes.shape[::-1])).all(axis=1)
+    np.add.at(votes, (cells[inside, 1], cells[inside, 0]), 1.0)
+    votes = cv2.blur(votes, (3, 3), borderType=cv2.BORDER_CONSTANT)
+    places = []
+    for _ in range(max(RANKS)):
+        row, column = divmod(int(votes.argmax()), votes.shape[1])
+        places.append((8.0 * column + 3.5, 8.0 * row + 3.5))
+        votes[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = -1.0
+    return np.array(places)
+
+
+class Vlad:
+    """Windows of a map by the sums of their descriptors' residuals (Jegou 2010), each projected at random."""
+
+    def __init__(self, places_m: FloatArray, descriptors: np.ndarray) -> None:
+        rng = np.random.default_rng(0)
+        sample = descriptors[rng.choice(len(descriptors), 8000, replace=False)].astype(np.float32)
+        stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 15, 1.0)
+        cv2.setRNGSeed(0)
+        self._words = cv2.kmeans(sample, WORDS, None, stop, 1, cv2.KMEANS_PP_CENTERS)[2]
+        self._projection = np.linalg.qr(rng.normal(size=(128, PROJECTED)))[0].astype(np.float32)
+        quantised = [self._quantised(some) for some in np.array_split(descriptors, 50)]
+        word, residual = (np.concatenate(part) for part in zip(*quantised, strict=True))
+        columns, rows = np.ceil(places_m.max(axis=0) / STEP_M).astype(int) + 1
+        sums = np.zeros((rows, columns, WORDS, PROJECTED), np.float32)
+        cell = np.floor(places_m / STEP_M).astype(int)
+        for shift in np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2):
+            there = cell + shift
+            inside = ((there >= 0) & (there < (columns, rows))).all(axis=1)
+            inside &= (np.abs(places_m - (there + 0.5) * STEP_M) < HALF_M).all(axis=1)
+            np.add.at(sums, (there[inside, 1], there[inside, 0], word[inside]), residual[inside])
+        used = sums.any(axis=(2, 3))
+        self._signatures = _normed(sums[used]).astype(np.float16)
+        self.middles_m = (np.argwhere(used)[:, ::-1] + 0.5) * STEP_M
+
+    @property
+    def bytes(self) -> int:
+        return int(self._signatures.nbytes)
+
+    def nearest(self, own: np.ndarray) -> FloatArray:
+        word, residual = self._quantised(own)
+        sums = np.zeros((WORDS, PROJECTED), np.float32)
+        np.add.at(sums, word, residual)
+        alike = self._signatures.astype(np.float32) @ _normed(sums[None])[0]
+        return np.asarray(self.middles_m[np.argsort(-alike)[: max(RANKS)]])
+
+    def _quantised(self, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        values = some.astype(np.float32)
+        word = np.argmin(np.square(self._words).sum(axis=1)[None] - 2.0 * values @ self._words.T, axis=1)
+        return word, (values - self._words[word]) @ self._projection
+
+
+def _normed(sums: np.ndarray) -> np.ndarray:
+    by_word = sums / np.maximum(np.linalg.norm(sums, axis=-1, keepdims=True), 1e-6)
+    flat = (np.sign(by_word) * np.sqrt(np.abs(by_word))).reshape(len(sums), -1)
+    return np.asarray(flat / np.maximum(np.linalg.norm(flat, axis=-1, keepdims=True), 1e-6))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    making = commands.add_parser("frames")
+    making.add_argument("pack", type=Path)
+    making.add_argument("out", type=Path)
+    making.add_argument("--look", choices=("flight", *map(str, SURVEYS)), default="flight")
+    making.add_argument("--seed", type=int, default=2)
+    making.set_defaults(run=make)
+    finding = commands.add_parser("find")
+    finding.add_argument("--height", choices=("ground", "barometer"), default="ground")
+    finding.add_argument("--hostile", choices=("mirrored", "absent"))
+    finding.add_argument("--threads", type=int, default=2)
+    finding.set_defaults(run=find)
+    other = commands.add_parser("others")
+    other.set_defaults(run=others)
+    for one in (finding, other):
+        one.add_argument("pack", type=Path)
+        one.add_argument("frames", type=Path)
+        one.add_argument("--heading", type=float, default=10.0)
+    for one in (making, finding, other):
+        one.add_argument("--count", type=int, default=40)
+        one.add_argument("--agl", type=float, default=120.0)
+    args = parser.parse_args()
+    cv2.setNumThreads(1)
+    args.run(args)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,248 @@
+"""``locate``: photos without a position, found in the whole of a map."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ortholoc_edge.adapters.camera import read_image
+from ortholoc_edge.bench import draw
+from ortholoc_edge.bench.sequence import read_flight
+from ortholoc_edge.cli.arguments import positive, triple, within, writable_folder
+from ortholoc_edge.cli.localize import georeferenced, sentence
+from ortholoc_edge.config import read_intrinsics
+from ortholoc_edge.errors import ConfigError, MapError
+from ortholoc_edge.geometry import frames, rotation
+from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
+from ortholoc_edge.geometry.camera import Camera
+from ortholoc_edge.geometry.rigid import Rigid3
+from ortholoc_edge.matching.types import Structural
+from ortholoc_edge.pipeline.frame import Frame
+from ortholoc_edge.pipeline.localizer import Localizer, LocalizerOptions
+from ortholoc_edge.pipeline.locate import Located, locate
+from ortholoc_edge.pipeline.outcome import Fix
+from ortholoc_edge.pipeline.record import outcome_record
+from ortholoc_edge.pipeline.search import Searcher, Sighting, fitting_level
+from ortholoc_edge.tiles.coarse import CoarseField
+from ortholoc_edge.tiles.lattice import Bounds
+from ortholoc_edge.tiles.pack import Pack
+from ortholoc_edge.tiles.store import MapStore
+
+# Of candidates that are told of in JSON.
+_TOLD = 5
+_UNKNOWN_HEADING_DEG = 180.0
+# Pixels of a coarse field: 200 MB.
+_MAX_FIELD_PX = 100e6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Photo:
+    """A photo and what is known of it: the body's attitude from true north; camera and truth where a sequence has
+    them."""
+
+    path: Path
+    image: Callable[[], ImageArray]
+    camera: Camera | None
+    ned_from_body: FloatArray
+    above_ground_m: float
+    height_m: float
+    truth: Rigid3 | None = None
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = subparsers.add_parser(
+        "locate",
+        help="find photos in a whole map, without a position",
+        description="Finds each photo in the whole map, or the part that --within names, from attitude and height "
+        "alone. A folder with a *_flight.csv stands for its photos, with the attitude and height that it has for them; "
+        "its positions are only compared with. Exit code 0: all were found; 1: not all.",
+    )
+    parser.add_argument("photos", type=Path, nargs="+", metavar="IMAGE")
+    parser.add_argument("--pack", type=Path, required=True)
+    parser.add_argument("--intrinsics", type=Path, metavar="K.json", help="as of localize; a flight folder has its own")
+    parser.add_argument(
+        "--attitude",
+        type=triple,
+        metavar="R,P,Y",
+        help="roll, pitch and yaw from true north of the body, degrees; the camera looks straight down, image top "
+        "toward the nose. Left out: level, heading unknown",
+    )
+    parser.add_argument(
+        "--heading-within",
+        type=within("an angle in degrees", float, 0.0, _UNKNOWN_HEADING_DEG),
+        metavar="DEG",
+        help="how far the yaw may be off; 180: it is unknown (default: 10, and 180 without --attitude)",
+    )
+    height = parser.add_mutually_exclusive_group()
+    height.add_argument("--agl", type=positive, metavar="M", help="height above the ground")
+    height.add_argument("--height", type=float, metavar="H", help="height in the pack's vertical datum")
+    parser.add_argument(
+        "--within",
+        type=_area,
+        metavar="E,N,RADIUS",
+        help="search this circle's square only: map coordinates and metres (default: all of the pack)",
+    )
+    parser.add_argument("--threads", type=within("a number of threads", int, 1, 64), default=2, help="default: 2")
+    parser.add_argument("--json", action="store_true", help="print a JSON object per photo")
+    parser.add_argument("--overlay", type=Path, metavar="DIR", help="draw the matched points on the photos, as PNG")
+    parser.set_defaults(run=run)
+
+
+def _area(text: str) -> Bounds:
+    easting, northing, radius = triple(text)
+    if radius <= 0:
+        raise argparse.ArgumentTypeError(f"{text!r}: a radius of {radius:g} m holds nothing")
+    return easting - radius, northing - radius, easting + radius, northing + radius
+
+
+def run(args: argparse.Namespace) -> int:
+    if args.overlay is not None:
+        writable_folder(args.overlay, "--overlay")
+    photos = [photo for path in args.photos for photo in _photos(path, args)]
+    reach_deg = args.heading_within
+    if reach_deg is None:
+        aided = args.attitude is not None or all(photo.truth is not None for photo in photos)
+        reach_deg = 10.0 if aided else _UNKNOWN_HEADING_DEG
+    missed = 0
+    searchers: dict[int, Searcher] = {}
+    with MapStore(Pack.open(args.pack)) as store:
+        try:
+            for photo in photos:
+                missed += not _answer(photo, math.radians(reach_deg), store, searchers, args)
+        finally:
+            for searcher in searchers.values():
+                searcher.close()
+    return 1 if missed else 0
+
+
+def _photos(path: Path, args: argparse.Namespace) -> Iterator[_Photo]:
+    if path.is_dir():
+        for record in read_flight(path):
+            height_m = float(record.map_from_camera.translation[2])
+            yield _Photo(
+                record.path, record.image, record.camera, record.ned_from_body, math.nan, height_m,
+                record.map_from_camera,
+            )  # fmt: skip
+        return
+    if args.intrinsics is None:
+        raise ConfigError(f"{path}: --intrinsics is missing; give the camera's, calibrate-focal finds them")
+    if args.agl is None and args.height is None:
+        raise ConfigError(f"{path}: its height is missing; give --agl or --height")
+    yield _Photo(
+        path,
+        lambda: read_image(path),
+        None,
+        rotation.from_euler(*np.radians(args.attitude or (0.0, 0.0, 0.0))),
+        math.nan if args.agl is None else args.agl,
+        math.nan if args.height is None else args.height,
+    )
+
+
+def _answer(
+    photo: _Photo, reach_rad: float, store: MapStore, searchers: dict[int, Searcher], args: argparse.Namespace
+) -> bool:
+    """Print what a photo comes to; whether that is a fix."""
+    image = photo.image()
+    camera = photo.camera or read_intrinsics(args.intrinsics, image.shape[1], image.shape[0])
+    searcher = _searcher(photo, camera, store, searchers, args)
+    georeference = store.pack.georeference
+    west, south, east, north = searcher.field.grid.bounds
+    turn = georeference.convergence_rad(np.array([(west + east) / 2, (south + north) / 2]))
+    sighting = Sighting(
+        image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8),
+        camera,
+        frames.map_from_ned_rotation(turn) @ photo.ned_from_body @ frames.BODY_FROM_NADIR_CAMERA,
+        reach_rad,
+        photo.above_ground_m,
+        photo.height_m,
+    )
+    localizer = Localizer(camera, store, Structural(), LocalizerOptions())
+    start = time.monotonic()
+    try:
+        located = locate(Frame(0, image, photo.path.name), sighting, searcher, localizer)
+    finally:
+        localizer.close()
+    took_s = time.monotonic() - start
+    if args.json:
+        print(json.dumps(_record(photo, located, store, took_s)), flush=True)
+    else:
+        print("\n".join(_lines(photo, located, store, took_s)), flush=True)
+    if args.overlay is not None:
+        caption = f"{photo.path.name}: " + sentence(located.outcome, georeference)[0]
+        picture = draw.overlay(image, located.outcome, photo.truth, camera, caption)
+        draw.write_png(args.overlay / f"{photo.path.stem}.png", picture)
+    return isinstance(located.outcome, Fix)
+
+
+def _searcher(
+    photo: _Photo, camera: Camera, store: MapStore, searchers: dict[int, Searcher], args: argparse.Namespace
+) -> Searcher:
+    """Over the level of the orthophoto that suits the photo's height."""
+    above_m = photo.above_ground_m
+    if not math.isfinite(above_m):
+        tiles = store.pack.manifest.dsm.tiles
+        # The highest ground makes the smallest footprint; a mean one will do.
+        above_m = max(photo.height_m - float(np.median([(tile.min_m + tile.max_m) / 2 for tile in tiles])), 1.0)
+    level = fitting_level(store.dop_grids, camera, above_m)
+    if level not in searchers:
+        grid = store.dop_grids[level]
+        bounds = args.within or store.bounds
+        pixels = (bounds[2] - bounds[0]) * (bounds[3] - bounds[1]) / grid.gsd_m**2
+        if pixels > _MAX_FIELD_PX:
+            raise MapError(
+                f"{photo.path.name}: taken from {above_m:.0f} m, it must be looked for at {grid.gsd_m:g} m per pixel, "
+                f"{pixels / 1e6:.0f} million pixels here, and {_MAX_FIELD_PX / 1e6:.0f} are allowed; give --within"
+            )
+        start = time.monotonic()
+        field = CoarseField.of(store, level, args.within)
+        print(
+            f"{field.known_km2:.1f} km2 at {field.grid.gsd_m:g} m per pixel, {field.bytes / 1e6:.1f} MB, "
+            f"made in {time.monotonic() - start:.1f} s",
+            file=sys.stderr,
+        )
+        searchers[level] = Searcher(field, args.threads)
+    return searchers[level]
+
+
+def _lines(photo: _Photo, located: Located, store: MapStore, took_s: float) -> list[str]:
+    first, *others = sentence(located.outcome, store.pack.georeference)
+    lines = [f"{photo.path.name}: {first}", *others]
+    if isinstance(located.outcome, Fix):
+        lines.append(f"fits {located.lead:.2f} times as well as the next place")
+    if photo.truth is not None and isinstance(located.outcome, Fix):
+        lines.append(f"{_error_m(located.outcome, photo.truth):.2f} m from where the sequence has it")
+    lines.append(f"{took_s:.1f} s, {len(located.tried)} of {len(located.candidates)} candidates looked at closely")
+    return lines
+
+
+def _record(photo: _Photo, located: Located, store: MapStore, took_s: float) -> dict[str, Any]:
+    record: dict[str, Any] = {"image": photo.path.name, **outcome_record(located.outcome)}
+    if isinstance(located.outcome, Fix):
+        record |= georeferenced(located.outcome, store.pack.georeference)
+    places = located.candidates[:_TOLD]
+    record |= {
+        "lead": located.lead if math.isfinite(located.lead) else None,
+        "candidates": [[one.easting_m, one.northing_m, one.score] for one in places],
+        "seconds": took_s,
+    }
+    if photo.truth is not None:
+        true = photo.truth.translation
+        away = [math.hypot(one.easting_m - true[0], one.northing_m - true[1]) for one in located.candidates]
+        record["candidates_away_m"] = away
+        if isinstance(located.outcome, Fix):
+            record["error_m"] = _error_m(located.outcome, photo.truth)
+    return record
+
+
+def _error_m(fix: Fix, truth: Rigid3) -> float:
+    return float(np.linalg.norm(fix.map_from_camera.translation - truth.translation))

@@ -1,0 +1,148 @@
+"""A frame of which nothing is known but attitude and height, to a fix or a rejection: search, then look closely.
+
+The search says where the frame may be; the localizer, with each of these places as a tight prior, whether it is there.
+A fix goes out only where one place alone convinces both.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Annotated, Final
+
+import numpy as np
+from msgspec import Meta, Struct
+
+from ortholoc_edge.geometry import rotation
+from ortholoc_edge.geometry.rigid import Rigid3
+from ortholoc_edge.pipeline.frame import Frame
+from ortholoc_edge.pipeline.localizer import Localizer
+from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
+from ortholoc_edge.pipeline.prior import PosePrior
+from ortholoc_edge.pipeline.search import Candidate, Searcher, Sighting
+
+# Of a candidate's place, in pixels of the field, of its heading and of its height above ground: half a step of what was
+# tried, and what relief adds.
+_PLACE_SIGMA_PX: Final = 2.0
+_TURN_SIGMA_RAD: Final = math.radians(2.0)
+_HEIGHT_SIGMA: Final = 0.04
+# Of an attitude that nothing else is said of.
+_TILT_SIGMA_RAD: Final = math.radians(1.0)
+# Fixes closer than this part of the height above ground are of one place.
+_SAME_PLACE: Final = 0.1
+
+
+class LocateOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How sure a place must be.
+
+    ``candidates``: of the search, that are looked at closely.
+    ``near_best``: part of the best one's score, below which a candidate is not.
+    ``min_lead``: score of the place that is right over that of the best other one, at least.
+    ``sure_lead``: where the best one has that much over the next and is right, no other is looked at.
+    """
+
+    candidates: Annotated[int, Meta(ge=1, le=100)] = 5
+    near_best: Annotated[float, Meta(ge=0, le=1)] = 0.6
+    min_lead: Annotated[float, Meta(ge=0)] = 1.05
+    sure_lead: Annotated[float, Meta(ge=1)] = 1.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Located:
+    """What a frame came to.
+
+    Attributes:
+        outcome: the fix, or why there is none.
+        candidates: of the search, the best first.
+        tried: what the localizer said of the first of them, as many as it was asked about.
+        lead: score of the place that is meant, over that of the best other one; 0 where there is none.
+    """
+
+    outcome: Outcome
+    candidates: list[Candidate]
+    tried: list[Outcome]
+    lead: float
+
+
+def locate(
+    frame: Frame,
+    sighting: Sighting,
+    searcher: Searcher,
+    localizer: Localizer,
+    options: LocateOptions | None = None,
+    proceed: Callable[[], bool] = lambda: True,
+) -> Located:
+    """Where a frame was taken.
+
+    Args:
+        sighting: the same frame in grey, and what is known of its pose.
+        proceed: asked before each candidate; False ends it as LATE.
+    Raises: ModelError if a matcher itself fails.
+    """
+    options = options or LocateOptions()
+    candidates = searcher.search(sighting)
+    tried: list[Outcome] = []
+    if not candidates:
+        why = "the frame shows too little ground, or nothing on it, for the map's coarse scale"
+        return Located(Rejected(frame.stamp_ns, Reason.FEW_MATCHES, why), candidates, tried, 0.0)
+    for candidate in candidates[: options.candidates]:
+        if candidate.score < options.near_best * candidates[0].score:
+            break
+        if not proceed():
+            late = Rejected(frame.stamp_ns, Reason.LATE, f"{len(tried)} of {len(candidates)} places were looked at")
+            return Located(late, candidates, tried, 0.0)
+        prior = _prior(candidate, sighting, searcher)
+        if prior is None:
+            tried.append(Rejected(frame.stamp_ns, Reason.MAP_NODATA, "the surface model has no data there"))
+            continue
+        tried.append(localizer.localize(frame, prior))
+        alone = len(candidates) == 1 or candidates[0].score >= options.sure_lead * candidates[1].score
+        if alone and isinstance(tried[0], Fix):
+            break
+    return judged(frame.stamp_ns, candidates, tried, options)
+
+
+def judged(stamp_ns: int, candidates: list[Candidate], tried: list[Outcome], options: LocateOptions) -> Located:
+    """What the localizer said of the first candidates, at least of one, put together."""
+    fixes = [(place, outcome) for place, outcome in zip(candidates, tried, strict=False) if isinstance(outcome, Fix)]
+    if not fixes:
+        first = tried[0]
+        assert isinstance(first, Rejected), "there are no fixes"
+        why = replace(first, detail=f"none of {len(tried)} likely places; at the likeliest: {first.detail}")
+        return Located(why, candidates, tried, 0.0)
+    meant, fix = fixes[0]
+    apart_m = _SAME_PLACE * meant.above_ground_m
+    for _, other in fixes[1:]:
+        if _apart_m(fix, other) > apart_m:
+            why = Rejected(
+                stamp_ns, Reason.AMBIGUOUS, "another place fits too, m away", _apart_m(fix, other), apart_m
+            )
+            return Located(why, candidates, tried, 0.0)
+    others = [place.score for place in candidates if place.distance_m(meant) > 2.0 * apart_m]
+    lead = meant.score / max(others) if others else math.inf
+    if lead < options.min_lead:
+        why = Rejected(
+            stamp_ns, Reason.AMBIGUOUS, "fit of the place over that of the best other", lead, options.min_lead
+        )
+        return Located(why, candidates, tried, lead)
+    return Located(fix, candidates, tried, lead)
+
+
+def _apart_m(fix: Fix, other: Fix) -> float:
+    return float(np.linalg.norm(fix.map_from_camera.translation[:2] - other.map_from_camera.translation[:2]))
+
+
+def _prior(candidate: Candidate, sighting: Sighting, searcher: Searcher) -> PosePrior | None:
+    """None where the ground's height is not known."""
+    above_m, place = candidate.above_ground_m, np.array([candidate.easting_m, candidate.northing_m])
+    height_m = sighting.height_m
+    if not math.isfinite(height_m):
+        height_m = float(searcher.field.ground_m(place[None])[0]) + above_m
+    if not math.isfinite(height_m):
+        return None
+    turned = rotation.exp([0.0, 0.0, candidate.turn_rad]) @ sighting.map_from_camera
+    place_m = math.hypot(_PLACE_SIGMA_PX * searcher.field.grid.gsd_m, _TILT_SIGMA_RAD * above_m)
+    height_sigma_m = _HEIGHT_SIGMA * above_m
+    sigmas = [place_m, place_m, height_sigma_m, _TILT_SIGMA_RAD, _TILT_SIGMA_RAD, _TURN_SIGMA_RAD]
+    return PosePrior(Rigid3(turned, np.append(place, height_m)), np.diag(np.square(sigmas)))

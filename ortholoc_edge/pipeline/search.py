@@ -1,0 +1,412 @@
+"""Where in a whole map a frame may have been taken, when nothing says where to look but attitude and height.
+
+The frame is rectified north-up at the map's coarse scale, for every heading and height that come into question, and its
+edge directions are correlated with the map's everywhere, by the Fourier transform. What comes out are candidates: the
+`Localizer` decides about each.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Final
+
+import cv2
+import numpy as np
+
+from ortholoc_edge.geometry import rotation
+from ortholoc_edge.geometry.arrays import BoolArray, Float32Array, FloatArray, ImageArray
+from ortholoc_edge.geometry.camera import Camera
+from ortholoc_edge.geometry.grid import RasterGrid
+from ortholoc_edge.matching.orientation import orientation_field
+from ortholoc_edge.pipeline.rectify import rectified
+from ortholoc_edge.tiles.coarse import MEAN_PX, CoarseField
+
+# Turn of a frame from one heading tried to the next: what a frame of 60 to 110 px bears to either side of it.
+_TURN_RAD: Final = math.radians(4.0)
+# And from one height to the next, as a factor.
+_ZOOM: Final = 1.14
+# Least side of the blocks that are transformed. Of 1024 px less is wasted on the rims, but a third more time is needed,
+# since they do not fit the cache, and 100 MB instead of 4.
+_BLOCK_PX: Final = 512
+_MAX_CANVAS_PX: Final = 256
+# A frame with less to see than this is not looked for, px; and from so many on its edges tell it from others.
+_MIN_CANVAS_PX: Final = 24
+_ENOUGH_PX: Final = 56
+# Places closer than this are the same, px.
+_APART_PX: Final = 8
+_PER_BLOCK: Final = 8
+# Beyond this heading, or with a barometer's height, frames are looked for at half the scale first, and again at full
+# scale at so many of the places found there.
+_NARROW_RAD: Final = math.radians(25.0)
+_LOOKED_AT: Final = 150
+# Templates of a block are held in memory at a time: 2 MB each at 512 px.
+_AT_A_TIME: Final = 12
+# Of the map's mean energy: where there is less, a frame that fits well does so by chance.
+_LEAST_ENERGY: Final = 0.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """A frame and what is known of its pose: all but the place.
+
+    Attributes:
+        grey: (H, W) uint8, as the camera gives it.
+        camera: its intrinsics.
+        map_from_camera: (3, 3) believed attitude.
+        heading_reach_rad: how far the heading may be off; pi: it is unknown.
+        above_ground_m: height of the camera over the ground; NaN where ``height_m`` tells it.
+        height_m: of the camera, in the map's heights, by a barometer; NaN where ``above_ground_m`` tells it.
+        height_reach: how far the height above ground may be off, as a part of it.
+    """
+
+    grey: ImageArray
+    camera: Camera
+    map_from_camera: FloatArray
+    heading_reach_rad: float
+    above_ground_m: float
+    height_m: float = math.nan
+    height_reach: float = 0.04
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A place where the frame may have been taken.
+
+    Attributes:
+        easting_m, northing_m: of the camera.
+        above_ground_m: height that it was tried for.
+        turn_rad: of the believed attitude about the vertical.
+        score: normalised correlation with the map, at most about 1.
+    """
+
+    easting_m: float
+    northing_m: float
+    above_ground_m: float
+    turn_rad: float
+    score: float
+
+    def distance_m(self, other: Candidate) -> float:
+        return math.hypot(self.easting_m - other.easting_m, self.northing_m - other.northing_m)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Template:
+    """The frame as one heading and height show it.
+
+    Attributes:
+        spectra: of real and imaginary part, padded to a block, scaled so that a product with the map's is a sum of
+            products over the root of the frame's own energy and its number of pixels.
+        turn_rad, above_ground_m: that it is for.
+        foot_px: (x, y) of the point below the camera.
+        pixels: that show the frame.
+    """
+
+    spectra: tuple[np.ndarray, np.ndarray]
+    turn_rad: float
+    above_ground_m: float
+    foot_px: tuple[int, int]
+    pixels: int
+
+
+def agreeing(
+    frames: Sequence[Sequence[Candidate]], moved_m: Sequence[FloatArray], apart_m: float, count: int = 20
+) -> list[Candidate]:
+    """Candidates of several frames put together by how the vehicle moved between them: where a field or a street
+    pattern looks like another the sequence decides.
+
+    Args:
+        frames: candidates of each, the latest last.
+        moved_m: (2,) east and north from each frame to the next, one less than there are frames.
+        apart_m: what a frame's place and the motion may be off together, up to the latest frame.
+    Returns: places of the latest frame, the best first; the score is the mean over the frames, and a frame that has
+    nothing near counts with its worst candidate's.
+    """
+    after = [np.sum(np.reshape(moved_m[k:], (-1, 2)), axis=0) for k in range(len(frames))]
+    now = [
+        [replace(one, easting_m=one.easting_m + float(x), northing_m=one.northing_m + float(y)) for one in found]
+        for found, (x, y) in zip(frames, after, strict=True)
+    ]
+    together = []
+    for place in (one for found in now for one in found):
+        scores = []
+        for found in now:
+            near = [one.score for one in found if one.distance_m(place) <= apart_m]
+            scores.append(max(near) if near else min((one.score for one in found), default=0.0))
+        together.append(replace(place, score=float(np.mean(scores))))
+    return distinct(together, apart_m, count)
+
+
+def fitting_level(grids: Sequence[RasterGrid], camera: Camera, above_ground_m: float) -> int:
+    """Of the levels of an orthophoto, finest first: the coarsest at which a frame taken straight down shows enough; the
+    finest if none is."""
+    short_m = above_ground_m * min(camera.width / camera.fx, camera.height / camera.fy)
+    fine = [level for level, grid in enumerate(grids) if short_m >= _ENOUGH_PX * grid.gsd_m]
+    return fine[-1] if fine else 0
+
+
+class Searcher:
+    """A map to look for frames in. Safe to use from several threads.
+
+    Args:
+        field: of the map.
+        threads: that share the work of one search.
+    """
+
+    def __init__(self, field: CoarseField, threads: int = 2) -> None:
+        self.field = field
+        self._half = field.halved()
+        self._pool = ThreadPoolExecutor(threads, thread_name_prefix="search")
+
+    def close(self) -> None:
+        self._pool.shutdown()
+
+    def search(self, sighting: Sighting, count: int = 20) -> list[Candidate]:
+        """The places where a frame fits best, the best first, each apart from the others by `_APART_PX`.
+
+        Args:
+            count: of places.
+        Returns: an empty list where the frame shows too little ground for the field's pixels, or has no edges.
+        """
+        if sighting.heading_reach_rad <= _NARROW_RAD and math.isfinite(sighting.above_ground_m):
+            found = self._everywhere(sighting, _scale(sighting, self.field, 1))
+        else:
+            # At half the scale, in steps twice as wide, an eighth of the work; whatever is promising there is looked at
+            # again.
+            rough = self._everywhere(sighting, _scale(sighting, self._half, 2))
+            apart_m = _APART_PX * self.field.grid.gsd_m
+            again = [self._pool.submit(self._near, sighting, place) for place in distinct(rough, apart_m, _LOOKED_AT)]
+            found = [candidate for future in again for candidate in future.result()]
+        return distinct(found, _APART_PX * self.field.grid.gsd_m, count)
+
+    def _everywhere(self, sighting: Sighting, scale: _Scale) -> list[Candidate]:
+        found: list[Candidate] = []
+        turns = _turns(sighting.heading_reach_rad, scale.turn_rad)
+        for above_m, blocks in _heights(sighting, scale):
+            tried = [(above_m * zoom, turn_rad) for zoom in _zooms(sighting.height_reach) for turn_rad in turns]
+            for first in range(0, len(tried), _AT_A_TIME):
+                made = self._pool.map(
+                    lambda pair: _template(sighting, scale, *pair), tried[first : first + _AT_A_TIME]
+                )
+                templates = [template for template in made if template is not None]
+                if not templates:
+                    continue
+                for part in self._pool.map(
+                    lambda block, those=templates: _search_block(scale, block, those, _PER_BLOCK), blocks
+                ):
+                    found += part
+        return found
+
+    def _near(self, sighting: Sighting, place: Candidate) -> list[Candidate]:
+        """The best place around one that was found at half the scale, at full scale."""
+        column, row = np.round(self.field.grid.px_from_map((place.easting_m, place.northing_m))).astype(int).tolist()
+        above_m, side = place.above_ground_m, 4 * _APART_PX
+        if not math.isfinite(sighting.above_ground_m):
+            # Here it is known better than to a step.
+            ground_m = float(self.field.ground_m(np.array([[place.easting_m, place.northing_m]]))[0])
+            above_m = sighting.height_m - ground_m if math.isfinite(ground_m) else above_m
+        needed_px = side + 2 * _margin_px(replace(sighting, above_ground_m=above_m), self.field, 1)
+        scale = _Scale(self.field, 1, _TURN_RAD, 2 * cv2.getOptimalDFTSize(-(-needed_px // 2)))
+        templates = [
+            template
+            for turn_rad in (place.turn_rad - _TURN_RAD, place.turn_rad, place.turn_rad + _TURN_RAD)
+            if (template := _template(sighting, scale, above_m, turn_rad)) is not None
+        ]
+        block = _Block(column - side // 2, row - side // 2, side)
+        return _search_block(scale, block, templates, 1) if templates else []
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scale:
+    """A pass over the map: its field, by how much coarser than what frames are rectified for, the step of the heading
+    and the side of the blocks."""
+
+    field: CoarseField
+    halving: int
+    turn_rad: float
+    block_px: int
+
+
+def _scale(sighting: Sighting, field: CoarseField, halving: int) -> _Scale:
+    """With blocks of which a third or more is their inside."""
+    margin_px = _margin_px(sighting, field, halving)
+    block_px = max(_BLOCK_PX // halving, 2 * cv2.getOptimalDFTSize(-(-3 * margin_px // 2)))
+    return _Scale(field, halving, halving * _TURN_RAD, block_px)
+
+
+def distinct(found: Sequence[Candidate], apart_m: float, count: int) -> list[Candidate]:
+    """The best, each apart from all better ones."""
+    kept: list[Candidate] = []
+    for candidate in sorted(found, key=lambda one: -one.score):
+        if all(candidate.distance_m(other) > apart_m for other in kept):
+            kept.append(candidate)
+        if len(kept) == count:
+            break
+    return kept
+
+
+def _turns(reach_rad: float, step_rad: float) -> list[float]:
+    count = max(math.ceil(2.0 * min(reach_rad, math.pi) / step_rad), 1)
+    # The middles of equal parts.
+    return [min(reach_rad, math.pi) * ((2 * k + 1) / count - 1.0) for k in range(count)]
+
+
+def _zooms(reach: float) -> list[float]:
+    count = max(math.ceil(2.0 * math.log1p(reach) / math.log(_ZOOM)), 1)
+    return [math.exp(math.log1p(reach) * ((2 * k + 1) / count - 1.0)) for k in range(count)]
+
+
+def _template(sighting: Sighting, scale: _Scale, above_m: float, turn_rad: float) -> _Template | None:
+    halving, block_px = scale.halving, scale.block_px
+    gsd_m = scale.field.grid.gsd_m / halving
+    map_from_camera = rotation.exp([0.0, 0.0, turn_rad]) @ sighting.map_from_camera
+    # Pixels of a north-up grid whose origin is below the camera, to the frame's.
+    ground_from_grid = np.array([[gsd_m, 0.0, 0.0], [0.0, -gsd_m, 0.0], [0.0, 0.0, -above_m]])
+    frame_from_grid = sighting.camera.matrix @ map_from_camera.T @ ground_from_grid
+    seen = rectified(sighting.grey, sighting.camera, frame_from_grid, _MAX_CANVAS_PX**2)
+    if seen is None or min(seen.image.shape) < _MIN_CANVAS_PX or max(seen.image.shape) > _MAX_CANVAS_PX:
+        return None
+    values = orientation_field(seen.image, seen.valid, MEAN_PX)
+    rows, columns = (side // halving for side in values.shape[1:])
+    corner = np.linalg.solve(frame_from_grid, seen.frame_from_canvas)
+    # A halved pixel's centre lies between those of two.
+    x, y = (round((-low - 0.5 * (halving - 1)) / halving) for low in (corner[:2, 2] / corner[2, 2]).tolist())
+    pixels = int(np.count_nonzero(seen.valid)) // halving**2
+    parts = [
+        np.asarray(
+            cv2.resize(part[: rows * halving, : columns * halving], (columns, rows), interpolation=cv2.INTER_AREA),
+            dtype=np.float32,
+        )
+        for part in values
+    ]
+    energy = sum(float(np.square(part).sum()) for part in parts)
+    if energy <= 0.0:
+        return None
+    spectra = []
+    for part in parts:
+        padded = np.zeros((block_px, block_px), np.float32)
+        np.multiply(part, np.float32(1.0 / math.sqrt(energy * pixels)), out=padded[:rows, :columns])
+        spectra.append(np.asarray(cv2.dft(padded, nonzeroRows=rows)))
+    return _Template((spectra[0], spectra[1]), turn_rad, above_m, (x, y), pixels)
+
+
+@dataclass(frozen=True, slots=True)
+class _Block:
+    """Pixels of the field that a camera may be above: from (column, row) on, ``side`` to each side.
+
+    ``heights``: of the ground that counts there, from and to, m; None: any.
+    """
+
+    column: int
+    row: int
+    side: int
+    heights: tuple[float, float] | None = None
+
+
+def _heights(sighting: Sighting, scale: _Scale) -> Iterator[tuple[float, list[_Block]]]:
+    """Heights above ground to look from, and the blocks of the map that each holds in."""
+    # A camera of a block needs the ground around it, up to half a canvas and more where it looks aslant.
+    field, side = scale.field, scale.block_px - 2 * _margin_px(sighting, scale.field, scale.halving)
+    blocks = [
+        _Block(column, row, side)
+        for row in range(0, field.grid.height, side)
+        for column in range(0, field.grid.width, side)
+    ]
+    if math.isfinite(sighting.above_ground_m):
+        yield sighting.above_ground_m, blocks
+        return
+    by_step: dict[int, list[_Block]] = {}
+    for block in blocks:
+        for step, heights in _steps(sighting, field, block):
+            by_step.setdefault(step, []).append(_Block(block.column, block.row, side, heights))
+    for step in sorted(by_step):
+        yield _ZOOM**step, by_step[step]
+
+
+def _steps(sighting: Sighting, field: CoarseField, block: _Block) -> Iterator[tuple[int, tuple[float, float]]]:
+    """Steps of height above ground that a block's ground asks for, each with the ground that it is right for."""
+    place = field.grid.crop(block.column, block.row, block.side, block.side)
+    around = np.stack(np.meshgrid(np.arange(0, block.side, 8), np.arange(0, block.side, 8)), axis=-1).reshape(-1, 2)
+    ground = field.ground_m(place.map_from_px(around))
+    above = sighting.height_m - ground[np.isfinite(ground)]
+    steps = np.unique(np.round(np.log(above[above > 1.0]) / math.log(_ZOOM)).astype(int))
+    for step in steps.tolist():
+        yield step, (sighting.height_m - _ZOOM ** (step + 0.6), sighting.height_m - _ZOOM ** (step - 0.6))
+
+
+def _margin_px(sighting: Sighting, field: CoarseField, halving: int) -> int:
+    """Pixels around a camera that its frame may show."""
+    camera, gsd_m = sighting.camera, field.grid.gsd_m
+    above_m = sighting.above_ground_m
+    if not math.isfinite(above_m):
+        lowest = float(np.nanmin(field.ground)) if np.isfinite(field.ground).any() else 0.0
+        above_m = max(sighting.height_m - lowest, 1.0)
+    corners = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]], np.float64)
+    rays = camera.unproject(corners) @ sighting.map_from_camera.T
+    slope = np.hypot(rays[:, 0], rays[:, 1]) / np.maximum(-rays[:, 2], 0.25)
+    reach = (1.0 + sighting.height_reach) * above_m * float(np.nan_to_num(slope, nan=4.0).max()) / gsd_m
+    return min(math.ceil(reach) + 3, _MAX_CANVAS_PX // halving)
+
+
+def _search_block(scale: _Scale, block: _Block, templates: Sequence[_Template], count: int) -> list[Candidate]:
+    """The ``count`` best places of a block, with the template that fits best at each."""
+    field, block_px = scale.field, scale.block_px
+    margin = (block_px - block.side) // 2
+    values = field.block(block.column - margin, block.row - margin, block_px)
+    squares = np.square(values[0]) + np.square(values[1])
+    inner = slice(margin, margin + block.side)
+    if not squares.any():
+        return []
+    spectra = [np.asarray(cv2.dft(part)) for part in values]
+    best = np.full((block.side, block.side), -np.inf, np.float32)
+    which = np.zeros(best.shape, np.int16)
+    for number, template in enumerate(templates):
+        product = cv2.mulSpectrums(spectra[0], template.spectra[0], 0, conjB=True)
+        cv2.add(product, cv2.mulSpectrums(spectra[1], template.spectra[1], 0, conjB=True), dst=product)
+        correlation = cv2.dft(product, flags=cv2.DFT_INVERSE | cv2.DFT_REAL_OUTPUT | cv2.DFT_SCALE)
+        x, y = template.foot_px
+        # The correlation is for the canvas' corner: the camera is at its foot.
+        here = correlation[margin - y : margin - y + block.side, margin - x : margin - x + block.side]
+        better = here > best
+        np.copyto(best, here, where=better)
+        which[better] = number
+    # The frame's shape is a turned one of many: a square of its size is near enough.
+    side = round(math.sqrt(float(np.mean([template.pixels for template in templates]))))
+    energy = cv2.boxFilter(squares, -1, (side, side), borderType=cv2.BORDER_CONSTANT)[inner, inner]
+    score = best / np.sqrt(np.maximum(energy, _LEAST_ENERGY * float(squares[squares > 0].mean())))
+    if block.heights is not None:
+        score[~_in_band(field, block)] = -np.inf
+    return list(_peaks(score, which, templates, field, block, count))
+
+
+def _in_band(field: CoarseField, block: _Block) -> BoolArray:
+    assert block.heights is not None
+    place = field.grid.crop(block.column, block.row, block.side, block.side)
+    coarse = np.arange(0.0, block.side + 8.0, 8.0)
+    ground = field.ground_m(place.map_from_px(np.stack(np.meshgrid(coarse, coarse), axis=-1).reshape(-1, 2)))
+    low, high = block.heights
+    with np.errstate(invalid="ignore"):
+        inside = (ground >= low) & (ground <= high)
+    wide = np.repeat(np.repeat(inside.reshape(len(coarse), -1), 8, axis=0), 8, axis=1)
+    return np.asarray(wide[: block.side, : block.side])
+
+
+def _peaks(
+    score: Float32Array,
+    which: np.ndarray,
+    templates: Sequence[_Template],
+    field: CoarseField,
+    block: _Block,
+    count: int,
+) -> Iterator[Candidate]:
+    for _ in range(count):
+        row, column = divmod(int(score.argmax()), block.side)
+        value = float(score[row, column])
+        if not value > 0.0:
+            return
+        template = templates[int(which[row, column])]
+        easting, northing = field.grid.map_from_px((block.column + column, block.row + row)).tolist()
+        yield Candidate(easting, northing, template.above_ground_m, template.turn_rad, value)
+        score[max(row - _APART_PX, 0) : row + _APART_PX + 1, max(column - _APART_PX, 0) : column + _APART_PX + 1] = -1.0
