@@ -38,12 +38,16 @@ class LocateOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     ``candidates``: of the search, that are looked at closely.
     ``near_best``: part of the best one's score, below which a candidate is not.
+    ``min_support``: `Fix.quality`, below which a fix counts for nothing. The gate's own limit is for the one place that
+        a prior means; of many places in which the search found likeness some pass it. Of 150 hostile frames five did,
+        with 0.127 at most; the least of 128 right ones is 0.308 (docs/studies/search.md).
     ``min_lead``: score of the place that is right over that of the best other one, at least.
     ``sure_lead``: where the best one has that much over the next and is right, no other is looked at.
     """
 
     candidates: Annotated[int, Meta(ge=1, le=100)] = 5
     near_best: Annotated[float, Meta(ge=0, le=1)] = 0.6
+    min_support: Annotated[float, Meta(ge=0, le=1)] = 0.2
     min_lead: Annotated[float, Meta(ge=0)] = 1.05
     sure_lead: Annotated[float, Meta(ge=1)] = 1.3
 
@@ -96,11 +100,20 @@ def locate(
         if prior is None:
             tried.append(Rejected(frame.stamp_ns, Reason.MAP_NODATA, "the surface model has no data there"))
             continue
-        tried.append(localizer.localize(frame, prior))
+        tried.append(_enough(localizer.localize(frame, prior), options))
         alone = len(candidates) == 1 or candidates[0].score >= options.sure_lead * candidates[1].score
         if alone and isinstance(tried[0], Fix):
             break
     return judged(frame.stamp_ns, candidates, tried, options)
+
+
+def _enough(outcome: Outcome, options: LocateOptions) -> Outcome:
+    if isinstance(outcome, Rejected) or outcome.quality >= options.min_support:
+        return outcome
+    detail, least = "part of the view that agrees, of a place that was searched for", options.min_support
+    return Rejected(
+        outcome.stamp_ns, Reason.LOW_INLIER_RATIO, detail, outcome.quality, least, outcome.timings_ms
+    )
 
 
 def judged(stamp_ns: int, candidates: list[Candidate], tried: list[Outcome], options: LocateOptions) -> Located:

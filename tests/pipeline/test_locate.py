@@ -86,6 +86,15 @@ def test_frame_without_anything(searcher: Searcher, localizer: Localizer) -> Non
     assert found.tried == []
 
 
+def test_a_fix_of_little_support_counts_for_nothing(searcher: Searcher, localizer: Localizer) -> None:
+    image = rendered.picture(TRUTH)
+    strict = LocateOptions(candidates=1, min_support=1.0)
+    found = locate(Frame(7, image, "x"), sighting(image), searcher, localizer, strict)
+    assert isinstance(found.outcome, Rejected)
+    assert found.outcome.reason is Reason.LOW_INLIER_RATIO
+    assert found.outcome.limit == 1.0
+
+
 def test_an_end_to_it(searcher: Searcher, localizer: Localizer) -> None:
     image = rendered.picture(TRUTH)
     found = locate(Frame(7, image, "x"), sighting(image), searcher, localizer, proceed=lambda: False)
