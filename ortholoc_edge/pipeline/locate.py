@@ -7,7 +7,7 @@ A fix goes out only where one place alone convinces both.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Final
 
@@ -15,12 +15,13 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from ortholoc_edge.geometry import rotation
+from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.localizer import Localizer
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.prior import PosePrior
-from ortholoc_edge.pipeline.search import Candidate, Searcher, Sighting
+from ortholoc_edge.pipeline.search import Candidate, Former, Searcher, Sighting, agreeing
 
 # Of a candidate's place, in pixels of the field, of its heading and of its height above ground: half a step of what was
 # tried, and what relief adds.
@@ -29,6 +30,12 @@ _TURN_SIGMA_RAD: Final = math.radians(2.0)
 _HEIGHT_SIGMA: Final = 0.04
 # Of an attitude that nothing else is said of.
 _TILT_SIGMA_RAD: Final = math.radians(1.0)
+# Of a frame, that later ones of the flight can make something of.
+_KEPT: Final = 60
+# What candidates of two frames may be apart for the same place: pixels of the field, and a part of how far the vehicle
+# has come.
+_AGREE_PX: Final = 5.0
+_AGREE_RATIO: Final = 0.05
 # Fixes closer than this part of the height above ground are of one place.
 _SAME_PLACE: Final = 0.1
 
@@ -58,7 +65,8 @@ class Located:
 
     Attributes:
         outcome: the fix, or why there is none.
-        candidates: of the search, the best first.
+        candidates: of the search, with what earlier frames say of them, the best first.
+        own: of the frame alone: what a later one wants to know of it.
         tried: what the localizer said of the first of them, as many as it was asked about.
         lead: score of the place that is meant, over that of the best other one; 0 where there is none.
     """
@@ -67,6 +75,7 @@ class Located:
     candidates: list[Candidate]
     tried: list[Outcome]
     lead: float
+    own: list[Candidate]
 
 
 def locate(
@@ -76,70 +85,76 @@ def locate(
     localizer: Localizer,
     options: LocateOptions | None = None,
     proceed: Callable[[], bool] = lambda: True,
+    within: FloatArray | None = None,
+    former: Sequence[Former] = (),
 ) -> Located:
     """Where a frame was taken.
 
     Args:
         sighting: the same frame in grey, and what is known of its pose.
+        within: see `Searcher.search`.
+        former: what earlier frames of the flight came to, of which the same was known.
         proceed: asked before each candidate; False ends it as LATE.
     Raises: ModelError if a matcher itself fails.
     """
     options = options or LocateOptions()
-    candidates = searcher.search(sighting)
+    own = searcher.search(sighting, _KEPT, within)
     tried: list[Outcome] = []
-    if not candidates:
+    if not own:
         why = "the frame shows too little ground, or nothing on it, for the map's coarse scale"
-        return Located(Rejected(frame.stamp_ns, Reason.FEW_MATCHES, why), candidates, tried, 0.0)
+        return Located(Rejected(frame.stamp_ns, Reason.FEW_MATCHES, why), own, tried, 0.0, own)
+    moved_m = max((float(np.linalg.norm(one.moved_m)) for one in former), default=0.0)
+    candidates = agreeing(own, former, _AGREE_PX * searcher.field.grid.gsd_m + _AGREE_RATIO * moved_m)
     for candidate in candidates[: options.candidates]:
         if candidate.score < options.near_best * candidates[0].score:
             break
         if not proceed():
             late = Rejected(frame.stamp_ns, Reason.LATE, f"{len(tried)} of {len(candidates)} places were looked at")
-            return Located(late, candidates, tried, 0.0)
+            return Located(late, candidates, tried, 0.0, own)
         prior = _prior(candidate, sighting, searcher)
         if prior is None:
             tried.append(Rejected(frame.stamp_ns, Reason.MAP_NODATA, "the surface model has no data there"))
             continue
-        tried.append(_enough(localizer.localize(frame, prior), options))
+        tried.append(localizer.localize(frame, prior))
         alone = len(candidates) == 1 or candidates[0].score >= options.sure_lead * candidates[1].score
-        if alone and isinstance(tried[0], Fix):
+        if alone and isinstance(_enough(tried[0], options), Fix):
             break
-    return judged(frame.stamp_ns, candidates, tried, options)
+    outcome, lead = judged(frame.stamp_ns, candidates, tried, options)
+    return Located(outcome, candidates, tried, lead, own)
 
 
 def _enough(outcome: Outcome, options: LocateOptions) -> Outcome:
     if isinstance(outcome, Rejected) or outcome.quality >= options.min_support:
         return outcome
     detail, least = "part of the view that agrees, of a place that was searched for", options.min_support
-    return Rejected(
-        outcome.stamp_ns, Reason.LOW_INLIER_RATIO, detail, outcome.quality, least, outcome.timings_ms
-    )
+    return Rejected(outcome.stamp_ns, Reason.LOW_INLIER_RATIO, detail, outcome.quality, least, outcome.timings_ms)
 
 
-def judged(stamp_ns: int, candidates: list[Candidate], tried: list[Outcome], options: LocateOptions) -> Located:
-    """What the localizer said of the first candidates, at least of one, put together."""
-    fixes = [(place, outcome) for place, outcome in zip(candidates, tried, strict=False) if isinstance(outcome, Fix)]
+def judged(
+    stamp_ns: int, candidates: list[Candidate], tried: list[Outcome], options: LocateOptions
+) -> tuple[Outcome, float]:
+    """What the localizer said of the first candidates, at least of one, put together; and `Located.lead`."""
+    enough = [_enough(outcome, options) for outcome in tried]
+    fixes = [(place, outcome) for place, outcome in zip(candidates, enough, strict=False) if isinstance(outcome, Fix)]
     if not fixes:
-        first = tried[0]
+        first = enough[0]
         assert isinstance(first, Rejected), "there are no fixes"
         why = replace(first, detail=f"none of {len(tried)} likely places; at the likeliest: {first.detail}")
-        return Located(why, candidates, tried, 0.0)
+        return why, 0.0
     meant, fix = fixes[0]
     apart_m = _SAME_PLACE * meant.above_ground_m
     for _, other in fixes[1:]:
         if _apart_m(fix, other) > apart_m:
-            why = Rejected(
-                stamp_ns, Reason.AMBIGUOUS, "another place fits too, m away", _apart_m(fix, other), apart_m
-            )
-            return Located(why, candidates, tried, 0.0)
+            why = Rejected(stamp_ns, Reason.AMBIGUOUS, "another place fits too, m away", _apart_m(fix, other), apart_m)
+            return why, 0.0
     others = [place.score for place in candidates if place.distance_m(meant) > 2.0 * apart_m]
     lead = meant.score / max(others) if others else math.inf
     if lead < options.min_lead:
         why = Rejected(
             stamp_ns, Reason.AMBIGUOUS, "fit of the place over that of the best other", lead, options.min_lead
         )
-        return Located(why, candidates, tried, lead)
-    return Located(fix, candidates, tried, lead)
+        return why, lead
+    return fix, lead
 
 
 def _apart_m(fix: Fix, other: Fix) -> float:

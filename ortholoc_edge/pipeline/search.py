@@ -111,32 +111,54 @@ class _Template:
     pixels: int
 
 
-def agreeing(
-    frames: Sequence[Sequence[Candidate]], moved_m: Sequence[FloatArray], apart_m: float, count: int = 20
-) -> list[Candidate]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Former:
+    """What an earlier frame of the same flight came to.
+
+    Attributes:
+        candidates: of its search.
+        moved_m: (2,) east and north, how the vehicle has moved since.
+    """
+
+    candidates: Sequence[Candidate]
+    moved_m: FloatArray
+
+
+def agreeing(latest: Sequence[Candidate], former: Sequence[Former], apart_m: float, count: int = 20) -> list[Candidate]:
     """Candidates of several frames put together by how the vehicle moved between them: where a field or a street
     pattern looks like another the sequence decides.
 
     Args:
-        frames: candidates of each, the latest last.
-        moved_m: (2,) east and north from each frame to the next, one less than there are frames.
         apart_m: what a frame's place and the motion may be off together, up to the latest frame.
     Returns: places of the latest frame, the best first; the score is the mean over the frames, and a frame that has
-    nothing near counts with its worst candidate's.
+    nothing near counts with its worst candidate's. With nothing ``former``, ``latest`` as it is.
     """
-    after = [np.sum(np.reshape(moved_m[k:], (-1, 2)), axis=0) for k in range(len(frames))]
-    now = [
-        [replace(one, easting_m=one.easting_m + float(x), northing_m=one.northing_m + float(y)) for one in found]
-        for found, (x, y) in zip(frames, after, strict=True)
+    if not former:
+        return list(latest)
+    now = [list(latest)]
+    for frame in former:
+        x, y = np.asarray(frame.moved_m, dtype=np.float64).tolist()
+        now.append(
+            [replace(one, easting_m=one.easting_m + x, northing_m=one.northing_m + y) for one in frame.candidates]
+        )
+    together = np.zeros(sum(map(len, now)))
+    places = np.array([(one.easting_m, one.northing_m) for found in now for one in found]).reshape(-1, 2)
+    for found in now:
+        if not found:
+            continue
+        scores = np.array([one.score for one in found])
+        theirs = np.array([(one.easting_m, one.northing_m) for one in found])
+        near = np.linalg.norm(places[:, None] - theirs, axis=2) <= apart_m
+        together += np.maximum(np.where(near, scores, -np.inf).max(axis=1), scores.min())
+    means = (together / len(now)).tolist()
+    # A place of the latest frame stands for what others have near it: its heading and height are this frame's.
+    own = [replace(one, score=mean) for one, mean in zip(latest, means, strict=False)]
+    others = [
+        replace(one, score=mean)
+        for one, mean in zip((one for found in now[1:] for one in found), means[len(own) :], strict=True)
     ]
-    together = []
-    for place in (one for found in now for one in found):
-        scores = []
-        for found in now:
-            near = [one.score for one in found if one.distance_m(place) <= apart_m]
-            scores.append(max(near) if near else min((one.score for one in found), default=0.0))
-        together.append(replace(place, score=float(np.mean(scores))))
-    return distinct(together, apart_m, count)
+    own = distinct(own, apart_m, count)
+    return distinct([*own, *(one for one in others if _apart(one, own, apart_m))], apart_m, count)
 
 
 def fitting_level(grids: Sequence[RasterGrid], camera: Camera, above_ground_m: float) -> int:
@@ -163,33 +185,32 @@ class Searcher:
     def close(self) -> None:
         self._pool.shutdown()
 
-    def search(self, sighting: Sighting, count: int = 20) -> list[Candidate]:
+    def search(self, sighting: Sighting, count: int = 20, within: FloatArray | None = None) -> list[Candidate]:
         """The places where a frame fits best, the best first, each apart from the others by `_APART_PX`.
 
         Args:
             count: of places.
+            within: (N, 2) corners of the area where the camera was, in the map; None: anywhere.
         Returns: an empty list where the frame shows too little ground for the field's pixels, or has no edges.
         """
         if sighting.heading_reach_rad <= _NARROW_RAD and math.isfinite(sighting.above_ground_m):
-            found = self._everywhere(sighting, _scale(sighting, self.field, 1))
+            found = self._everywhere(sighting, _scale(sighting, self.field, 1), within)
         else:
             # At half the scale, in steps twice as wide, an eighth of the work; whatever is promising there is looked at
             # again.
-            rough = self._everywhere(sighting, _scale(sighting, self._half, 2))
+            rough = self._everywhere(sighting, _scale(sighting, self._half, 2), within)
             apart_m = _APART_PX * self.field.grid.gsd_m
             again = [self._pool.submit(self._near, sighting, place) for place in distinct(rough, apart_m, _LOOKED_AT)]
             found = [candidate for future in again for candidate in future.result()]
         return distinct(found, _APART_PX * self.field.grid.gsd_m, count)
 
-    def _everywhere(self, sighting: Sighting, scale: _Scale) -> list[Candidate]:
+    def _everywhere(self, sighting: Sighting, scale: _Scale, within: FloatArray | None) -> list[Candidate]:
         found: list[Candidate] = []
         turns = _turns(sighting.heading_reach_rad, scale.turn_rad)
-        for above_m, blocks in _heights(sighting, scale):
+        for above_m, blocks in _heights(sighting, scale, within):
             tried = [(above_m * zoom, turn_rad) for zoom in _zooms(sighting.height_reach) for turn_rad in turns]
             for first in range(0, len(tried), _AT_A_TIME):
-                made = self._pool.map(
-                    lambda pair: _template(sighting, scale, *pair), tried[first : first + _AT_A_TIME]
-                )
+                made = self._pool.map(lambda pair: _template(sighting, scale, *pair), tried[first : first + _AT_A_TIME])
                 templates = [template for template in made if template is not None]
                 if not templates:
                     continue
@@ -236,15 +257,26 @@ def _scale(sighting: Sighting, field: CoarseField, halving: int) -> _Scale:
     return _Scale(field, halving, halving * _TURN_RAD, block_px)
 
 
+def circle(middle: FloatArray, radius_m: float) -> FloatArray:
+    """(32, 2) corners of an area that holds a circle, to search within."""
+    angles = np.arange(32) * (2.0 * math.pi / 32)
+    reach_m = radius_m / math.cos(math.pi / 32)
+    return np.asarray(middle, dtype=np.float64)[:2] + reach_m * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+
 def distinct(found: Sequence[Candidate], apart_m: float, count: int) -> list[Candidate]:
     """The best, each apart from all better ones."""
     kept: list[Candidate] = []
     for candidate in sorted(found, key=lambda one: -one.score):
-        if all(candidate.distance_m(other) > apart_m for other in kept):
+        if _apart(candidate, kept, apart_m):
             kept.append(candidate)
         if len(kept) == count:
             break
     return kept
+
+
+def _apart(candidate: Candidate, others: Sequence[Candidate], apart_m: float) -> bool:
+    return all(candidate.distance_m(other) > apart_m for other in others)
 
 
 def _turns(reach_rad: float, step_rad: float) -> list[float]:
@@ -292,27 +324,33 @@ def _template(sighting: Sighting, scale: _Scale, above_m: float, turn_rad: float
     return _Template((spectra[0], spectra[1]), turn_rad, above_m, (x, y), pixels)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Block:
     """Pixels of the field that a camera may be above: from (column, row) on, ``side`` to each side.
 
-    ``heights``: of the ground that counts there, from and to, m; None: any.
+    Attributes:
+        within: as of `Searcher.search`.
+        heights: of the ground that counts there, from and to, m; None: any.
     """
 
     column: int
     row: int
     side: int
+    within: FloatArray | None = None
     heights: tuple[float, float] | None = None
 
 
-def _heights(sighting: Sighting, scale: _Scale) -> Iterator[tuple[float, list[_Block]]]:
+def _heights(sighting: Sighting, scale: _Scale, within: FloatArray | None) -> Iterator[tuple[float, list[_Block]]]:
     """Heights above ground to look from, and the blocks of the map that each holds in."""
     # A camera of a block needs the ground around it, up to half a canvas and more where it looks aslant.
     field, side = scale.field, scale.block_px - 2 * _margin_px(sighting, scale.field, scale.halving)
+    left, upper, right, lower = 0, 0, field.grid.width, field.grid.height
+    if within is not None:
+        px = field.grid.px_from_map(within)
+        left, upper = np.maximum(np.floor(px.min(axis=0)).astype(int), 0).tolist()
+        right, lower = np.minimum(np.ceil(px.max(axis=0)).astype(int) + 1, (right, lower)).tolist()
     blocks = [
-        _Block(column, row, side)
-        for row in range(0, field.grid.height, side)
-        for column in range(0, field.grid.width, side)
+        _Block(column, row, side, within) for row in range(upper, lower, side) for column in range(left, right, side)
     ]
     if math.isfinite(sighting.above_ground_m):
         yield sighting.above_ground_m, blocks
@@ -320,7 +358,7 @@ def _heights(sighting: Sighting, scale: _Scale) -> Iterator[tuple[float, list[_B
     by_step: dict[int, list[_Block]] = {}
     for block in blocks:
         for step, heights in _steps(sighting, field, block):
-            by_step.setdefault(step, []).append(_Block(block.column, block.row, side, heights))
+            by_step.setdefault(step, []).append(replace(block, heights=heights))
     for step in sorted(by_step):
         yield _ZOOM**step, by_step[step]
 
@@ -378,6 +416,8 @@ def _search_block(scale: _Scale, block: _Block, templates: Sequence[_Template], 
     score = best / np.sqrt(np.maximum(energy, _LEAST_ENERGY * float(squares[squares > 0].mean())))
     if block.heights is not None:
         score[~_in_band(field, block)] = -np.inf
+    if block.within is not None:
+        score[~_inside(field, block)] = -np.inf
     return list(_peaks(score, which, templates, field, block, count))
 
 
@@ -391,6 +431,14 @@ def _in_band(field: CoarseField, block: _Block) -> BoolArray:
         inside = (ground >= low) & (ground <= high)
     wide = np.repeat(np.repeat(inside.reshape(len(coarse), -1), 8, axis=0), 8, axis=1)
     return np.asarray(wide[: block.side, : block.side])
+
+
+def _inside(field: CoarseField, block: _Block) -> BoolArray:
+    assert block.within is not None
+    corners = np.round(field.grid.px_from_map(block.within) - (block.column, block.row)).astype(np.int32)
+    mask = np.zeros((block.side, block.side), np.uint8)
+    cv2.fillPoly(mask, [corners], 1)
+    return mask.astype(bool)
 
 
 def _peaks(

@@ -109,8 +109,7 @@ NO = Rejected(7, Reason.LOW_CONTRAST, "looks like nothing", 3.0, 10.5)
 
 
 def outcome_of(tried: list[Outcome], min_lead: float = 1.05) -> tuple[Outcome, float]:
-    located = judged(7, PLACES, tried, LocateOptions(min_lead=min_lead))
-    return located.outcome, located.lead
+    return judged(7, PLACES, tried, LocateOptions(min_lead=min_lead))
 
 
 def test_one_place_that_convinces_both() -> None:

@@ -15,7 +15,16 @@ from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.grid import RasterGrid
 from ortholoc_edge.matching.orientation import orientation_field
-from ortholoc_edge.pipeline.search import Candidate, Searcher, Sighting, agreeing, distinct, fitting_level
+from ortholoc_edge.pipeline.search import (
+    Candidate,
+    Former,
+    Searcher,
+    Sighting,
+    agreeing,
+    circle,
+    distinct,
+    fitting_level,
+)
 from ortholoc_edge.tiles.coarse import MEAN_PX, CoarseField
 
 CAMERA = Camera.from_focal(320, 240, 270.0)
@@ -155,19 +164,55 @@ def test_a_sequence_decides_what_a_frame_can_not() -> None:
     first = places((0.0, 0.0, 0.31), (500.0, 80.0, 0.29))
     second = places((900.0, 900.0, 0.30), (540.0, 52.0, 0.28))
     moved = np.array([42.0, -30.0])
-    found = agreeing([first, second], [moved], 8.0)
+    found = agreeing(second, [Former(first, moved)], 8.0)
     assert (found[0].easting_m, found[0].northing_m) == pytest.approx((540.0, 52.0), abs=3.0)
     assert found[0].score == pytest.approx((0.29 + 0.28) / 2)
     # A place of one frame alone has the other's worst for company.
     assert found[1].score == pytest.approx((0.31 + 0.2) / 2)
     # Moved the other way, nothing agrees.
-    assert agreeing([first, second], [-moved], 8.0)[0].score == pytest.approx((0.31 + 0.2) / 2)
-    assert agreeing([second], [], 8.0) == second
+    assert agreeing(second, [Former(first, -moved)], 8.0)[0].score == pytest.approx((0.31 + 0.2) / 2)
+    assert agreeing(second, [], 8.0) == second
     # Three frames, the middle one blind.
     third = places((545.0, 100.0, 0.3))
-    [best, *_] = agreeing([first, [], third], [moved, np.array([5.0, 48.0])], 8.0)
+    last = np.array([5.0, 48.0])
+    [best, *_] = agreeing(third, [Former(first, moved + last), Former([], last)], 8.0)
     assert best.northing_m == pytest.approx(100.0, abs=3.0)
     assert best.score == pytest.approx((0.29 + 0.3) / 3)
+
+
+def test_a_place_that_only_an_earlier_frame_had() -> None:
+    seen_before = [Candidate(10.0, 0.0, 100.0, 0.1, 0.5)]
+    [best] = agreeing([], [Former(seen_before, np.array([0.0, 30.0]))], 8.0)
+    assert (best.easting_m, best.northing_m, best.score) == (10.0, 30.0, 0.25)
+
+
+@pytest.mark.parametrize("reach_deg", [10.0, 60.0])
+def test_only_inside_an_area(searcher: Searcher, reach_deg: float) -> None:
+    """The right place is the best of all, and is not found where it is left out; nor is what is beyond."""
+    turn = turned_down()
+    sighting = Sighting(seen(PLACE, turn, ABOVE_M), CAMERA, turn, math.radians(reach_deg), ABOVE_M)
+    there = circle(PLACE + np.array([60.0, 0.0]), 80.0)
+    inside = searcher.search(sighting, within=there)
+    assert away_m(inside[0], PLACE) < 4.0
+    assert inside[0].score == pytest.approx(searcher.search(sighting)[0].score, abs=0.02)
+    elsewhere = np.array([[400_500.0, 4_999_200.0], [401_200.0, 4_999_200.0], [401_200.0, 4_999_900.0]])
+    found = searcher.search(sighting, within=elsewhere)
+    assert found
+    # A pixel of the pyramid, and the lattice on which a half is looked at again, are what it may be beyond.
+    slack_m = 0.0 if reach_deg == 10.0 else 40.0
+    for one in found:
+        assert cv2.pointPolygonTest(
+            elsewhere.astype(np.float32) - np.float32([400_000.0, 5_000_000.0]),
+            (one.easting_m - 400_000.0, one.northing_m - 5_000_000.0),
+            True,
+        ) > -(2.0 * GSD_M + slack_m)
+    assert searcher.search(sighting, within=circle(np.array([390_000.0, 5_000_000.0]), 100.0)) == []
+
+
+def test_a_circle_holds_what_it_should() -> None:
+    corners = circle(np.array([5.0, -3.0, 99.0]), 100.0)
+    middles = (corners + np.roll(corners, 1, axis=0)) / 2
+    assert np.linalg.norm(middles - (5.0, -3.0), axis=1) == pytest.approx(100.0)
 
 
 def test_level_that_suits_a_height() -> None:
