@@ -38,9 +38,7 @@ _ENOUGH_PX: Final = 56
 # Places closer than this are the same, px.
 _APART_PX: Final = 8
 _PER_BLOCK: Final = 8
-# Beyond this heading, or with a barometer's height, frames are looked for at half the scale first, and again at full
-# scale at so many of the places found there.
-_NARROW_RAD: Final = math.radians(25.0)
+# Places found at half the scale that are looked at again at full scale.
 _LOOKED_AT: Final = 150
 # Templates of a block are held in memory at a time: 2 MB each at 512 px.
 _AT_A_TIME: Final = 12
@@ -193,16 +191,13 @@ class Searcher:
             within: (N, 2) corners of the area where the camera was, in the map; None: anywhere.
         Returns: an empty list where the frame shows too little ground for the field's pixels, or has no edges.
         """
-        if sighting.heading_reach_rad <= _NARROW_RAD and math.isfinite(sighting.above_ground_m):
-            found = self._everywhere(sighting, _scale(sighting, self.field, 1), within)
-        else:
-            # At half the scale, in steps twice as wide, an eighth of the work; whatever is promising there is looked at
-            # again.
-            rough = self._everywhere(sighting, _scale(sighting, self._half, 2), within)
-            apart_m = _APART_PX * self.field.grid.gsd_m
-            again = [self._pool.submit(self._near, sighting, place) for place in distinct(rough, apart_m, _LOOKED_AT)]
-            found = [candidate for future in again for candidate in future.result()]
-        return distinct(found, _APART_PX * self.field.grid.gsd_m, count)
+        # At half the scale, in steps twice as wide, an eighth of the work; whatever is promising there is looked at
+        # again.
+        rough = self._everywhere(sighting, _scale(sighting, self._half, 2), within)
+        apart_m = _APART_PX * self.field.grid.gsd_m
+        again = [self._pool.submit(self._near, sighting, place) for place in distinct(rough, apart_m, _LOOKED_AT)]
+        found = [candidate for future in again for candidate in future.result()]
+        return distinct(found, apart_m, count)
 
     def _everywhere(self, sighting: Sighting, scale: _Scale, within: FloatArray | None) -> list[Candidate]:
         found: list[Candidate] = []
