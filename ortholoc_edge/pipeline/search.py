@@ -28,6 +28,8 @@ from ortholoc_edge.tiles.coarse import MEAN_PX, CoarseField
 _TURN_RAD: Final = math.radians(4.0)
 # And from one height to the next, as a factor.
 _ZOOM: Final = 1.14
+# The same where a place is looked at again.
+_FINE_ZOOM: Final = 1.02
 # Least side of the blocks that are transformed. Of 1024 px less is wasted on the rims, but a third more time is needed,
 # since they do not fit the cache, and 100 MB instead of 4.
 _BLOCK_PX: Final = 512
@@ -195,8 +197,9 @@ class Searcher:
         # again.
         rough = self._everywhere(sighting, _scale(sighting, self._half, 2), within)
         apart_m = _APART_PX * self.field.grid.gsd_m
-        again = [self._pool.submit(self._near, sighting, place) for place in distinct(rough, apart_m, _LOOKED_AT)]
-        found = [candidate for future in again for candidate in future.result()]
+        near = _Near(sighting, self.field, within)
+        places = distinct(rough, apart_m, _LOOKED_AT)
+        found = [candidate for here in self._pool.map(near.best, places) for candidate in here]
         return distinct(found, apart_m, count)
 
     def _everywhere(self, sighting: Sighting, scale: _Scale, within: FloatArray | None) -> list[Candidate]:
@@ -215,23 +218,38 @@ class Searcher:
                     found += part
         return found
 
-    def _near(self, sighting: Sighting, place: Candidate) -> list[Candidate]:
-        """The best place around one that was found at half the scale, at full scale."""
-        column, row = np.round(self.field.grid.px_from_map((place.easting_m, place.northing_m))).astype(int).tolist()
-        above_m, side = place.above_ground_m, 4 * _APART_PX
-        if not math.isfinite(sighting.above_ground_m):
+
+class _Near:
+    """The surroundings of places that were found at half the scale, at full scale."""
+
+    def __init__(self, sighting: Sighting, field: CoarseField, within: FloatArray | None) -> None:
+        self._sighting, self._field, self._within = sighting, field, within
+        # Many places have the same heading and height. Made twice, where threads want one at once, they are the same.
+        self._made: dict[tuple[float, float], _Template | None] = {}
+
+    def best(self, place: Candidate) -> list[Candidate]:
+        """The best place around; none outside of the area."""
+        field, above_m, side = self._field, place.above_ground_m, 4 * _APART_PX
+        column, row = np.round(field.grid.px_from_map((place.easting_m, place.northing_m))).astype(int).tolist()
+        if not math.isfinite(self._sighting.above_ground_m):
             # Here it is known better than to a step.
-            ground_m = float(self.field.ground_m(np.array([[place.easting_m, place.northing_m]]))[0])
-            above_m = sighting.height_m - ground_m if math.isfinite(ground_m) else above_m
-        needed_px = side + 2 * _margin_px(replace(sighting, above_ground_m=above_m), self.field, 1)
-        scale = _Scale(self.field, 1, _TURN_RAD, 2 * cv2.getOptimalDFTSize(-(-needed_px // 2)))
-        templates = [
-            template
-            for turn_rad in (place.turn_rad - _TURN_RAD, place.turn_rad, place.turn_rad + _TURN_RAD)
-            if (template := _template(sighting, scale, above_m, turn_rad)) is not None
-        ]
-        block = _Block(column - side // 2, row - side // 2, side)
+            ground_m = float(field.ground_m(np.array([[place.easting_m, place.northing_m]]))[0])
+            if self._sighting.height_m - ground_m > 1.0:
+                steps = round(math.log(self._sighting.height_m - ground_m) / math.log(_FINE_ZOOM))
+                above_m = _FINE_ZOOM**steps
+        needed_px = side + 2 * _margin_px(replace(self._sighting, above_ground_m=above_m), field, 1)
+        scale = _Scale(field, 1, _TURN_RAD, 2 * cv2.getOptimalDFTSize(-(-needed_px // 2)))
+        turns = (place.turn_rad - _TURN_RAD, place.turn_rad, place.turn_rad + _TURN_RAD)
+        tried = [self._template(scale, above_m, turn_rad) for turn_rad in turns]
+        templates = [template for template in tried if template is not None]
+        block = _Block(column - side // 2, row - side // 2, side, self._within)
         return _search_block(scale, block, templates, 1) if templates else []
+
+    def _template(self, scale: _Scale, above_m: float, turn_rad: float) -> _Template | None:
+        key = above_m, round(turn_rad, 6)
+        if key not in self._made:
+            self._made[key] = _template(self._sighting, scale, above_m, turn_rad)
+        return self._made[key]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

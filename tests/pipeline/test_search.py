@@ -138,7 +138,7 @@ def test_what_is_not_there_stands_out_by_little(searcher: Searcher) -> None:
     turn = turned_down(3.0, 50.0)
     for frame in (seen(PLACE, turn, ABOVE_M, seed=2), seen(PLACE, turn, ABOVE_M)[:, ::-1].copy()):
         found = searcher.search(Sighting(frame, CAMERA, turn, math.radians(10.0), ABOVE_M))
-        assert found[0].score < 1.2 * found[1].score
+        assert found[0].score < 1.3 * found[1].score
 
 
 def test_frames_that_show_nothing(searcher: Searcher) -> None:
@@ -198,14 +198,12 @@ def test_only_inside_an_area(searcher: Searcher, reach_deg: float) -> None:
     elsewhere = np.array([[400_500.0, 4_999_200.0], [401_200.0, 4_999_200.0], [401_200.0, 4_999_900.0]])
     found = searcher.search(sighting, within=elsewhere)
     assert found
-    # A pixel of the pyramid, and the lattice on which a half is looked at again, are what it may be beyond.
-    slack_m = 0.0 if reach_deg == 10.0 else 40.0
     for one in found:
         assert cv2.pointPolygonTest(
             elsewhere.astype(np.float32) - np.float32([400_000.0, 5_000_000.0]),
             (one.easting_m - 400_000.0, one.northing_m - 5_000_000.0),
             True,
-        ) > -(2.0 * GSD_M + slack_m)
+        ) > -GSD_M
     assert searcher.search(sighting, within=circle(np.array([390_000.0, 5_000_000.0]), 100.0)) == []
 
 
