@@ -31,6 +31,7 @@ from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.matching.providers import ProviderName
 from ortholoc_edge.matching.types import STRUCTURAL
+from ortholoc_edge.pipeline.finder import SearchOptions
 from ortholoc_edge.pipeline.ladder import LadderOptions
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
 from ortholoc_edge.pipeline.navigator import TimingOptions
@@ -211,6 +212,7 @@ class Config(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     localizer: LocalizerOptions = field(default_factory=LocalizerOptions)
     tracker: TrackerOptions = field(default_factory=TrackerOptions)
     witness: WitnessOptions = field(default_factory=WitnessOptions)
+    search: SearchOptions = field(default_factory=SearchOptions)
     attitude: AttitudeOptions = field(default_factory=AttitudeOptions)
     timing: TimingOptions = field(default_factory=TimingOptions)
     ladder: LadderOptions = field(default_factory=LadderOptions)

@@ -27,7 +27,7 @@ from ortholoc_edge.adapters.camera import BadFrameError, Counting, EndOfFrames, 
 from ortholoc_edge.adapters.commands import Answer, BusyError, Desk
 from ortholoc_edge.adapters.computer import ComputerReader
 from ortholoc_edge.adapters.flight_log import FlightLog
-from ortholoc_edge.adapters.mavlink import AutopilotLink, Statistic, SystemStatus
+from ortholoc_edge.adapters.mavlink import AutopilotLink, Severity, Statistic, SystemStatus
 from ortholoc_edge.adapters.messages import NAME_OF_COMMAND, Command, CommandReply, ConfigMessage
 from ortholoc_edge.clock import Clock, SystemClock, wall_clock_ns
 from ortholoc_edge.commander import Commander
@@ -36,6 +36,7 @@ from ortholoc_edge.errors import CameraError, LinkError, MapError, OrtholocError
 from ortholoc_edge.matching.registry import make_method
 from ortholoc_edge.matching.types import AnyMatcher
 from ortholoc_edge.pipeline import structural
+from ortholoc_edge.pipeline.finder import Finder, Seeker
 from ortholoc_edge.pipeline.frame import Frame, VehicleState
 from ortholoc_edge.pipeline.localizer import Localizer
 from ortholoc_edge.pipeline.navigator import Circumstances, Navigator, Tuning
@@ -44,6 +45,7 @@ from ortholoc_edge.pipeline.tracker import Tracker
 from ortholoc_edge.pose import pnp
 from ortholoc_edge.reload import Plan
 from ortholoc_edge.reporting import OutcomeListener, Reporter
+from ortholoc_edge.search_process import SearchProcess, SearchSetup
 from ortholoc_edge.tiles.georeference import Georeference
 from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.store import MapStore
@@ -129,6 +131,7 @@ class Daemon:
         matcher: AnyMatcher | None = None,
         clock: Clock | None = None,
         computer: ComputerReader | None = None,
+        seek_with: Callable[[SearchSetup], Seeker] = SearchProcess,
         on_outcome: OutcomeListener | None = None,
     ) -> None:
         """
@@ -136,6 +139,7 @@ class Daemon:
             frames: instead of ``config.camera``.
             matcher: instead of ``config.matcher``.
             computer: whose load and heat are looked at, instead of this one.
+            seek_with: makes what searches the map, where ``config.search`` wants that.
             on_outcome: told of every outcome, in the worker's thread; must return at once.
         """
         self._config = config
@@ -169,6 +173,9 @@ class Daemon:
             tracker = self._navigator.tracker
             self._vehicle = Vehicle(
                 self._link, tracker, georeference, config.mount, config.attitude, self._clock, self._counts
+            )
+            self._finder = (
+                resources.enter_context(closing(self._new_finder(config, seek_with))) if config.search.enabled else None
             )
             self._log = resources.enter_context(closing(self._flight_log(config))) if config.log.folder else None
             self._commander = Commander(
@@ -213,6 +220,21 @@ class Daemon:
         self._capture_failure: BaseException | None = None
         self._capture_beat_ns = self._clock.now_ns()
 
+    def _new_finder(self, config: Config, seek_with: Callable[[SearchSetup], Seeker]) -> Finder:
+        working = self._navigator.localizer.working_camera
+        camera = config.intrinsics.camera().resized(working.width, working.height)
+        setup = SearchSetup(
+            Path(config.map.pack),
+            None if config.map.public_key is None else Path(config.map.public_key),
+            camera,
+            structs.replace(config.localizer, precomputed_features="never", calibrate=False),
+            config.search.threads,
+            config.search.max_mb,
+        )
+        tracker, georeference = self._navigator.tracker, self._store.pack.georeference
+        seeker = seek_with(setup)
+        return Finder(config.search, seeker, tracker, config.tracker, georeference, camera, self._counts)
+
     def _unix_minus_stamp_ns(self) -> int:
         # A clock that somebody sets, in simulation, is its own date.
         return wall_clock_ns() - self._clock.now_ns() if isinstance(self._clock, SystemClock) else 0
@@ -253,6 +275,8 @@ class Daemon:
         tuning = tuning_of(plan.config)
         if tuning != tuning_of(self._config):
             self._navigator.retune(tuning)
+        if self._finder is not None:
+            self._finder.retune(plan.config.tracker)
         self._navigator.ladder.allow(plan.config.timing.budget_ms, plan.config.ladder, self._clock.now_ns())
         self._vehicle.retune(plan.config.attitude)
         self._commander.lost_sigma_m = plan.config.tracker.lost_sigma_m
@@ -459,7 +483,17 @@ class Daemon:
         step = localized.outcome, localized.state, localized.circumstances
         self._reporter.publish(frame, outcome, step)
         self._commander.note(frame, outcome, step)
+        if self._finder is not None:
+            self._search(self._finder, localized)
         return outcome
+
+    def _search(self, finder: Finder, localized: Localized) -> None:
+        order = finder.step(localized.frame, localized.state, localized.outcome, self._clock.now_ns())
+        if order is not None:
+            logger.warning("the search: %s", order.why)
+            self._navigator.give(order)
+        for notice in finder.take_notices():
+            self._link.send_status_text(Severity.WARNING, notice)
 
     def _age_ms(self, stamp_ns: int) -> float:
         return (self._clock.now_ns() - stamp_ns) / 1e6

@@ -8,6 +8,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from ortholoc_edge.bench.sequence import read_flight
 from ortholoc_edge.cli.arguments import positive, triple, within, writable_folder
 from ortholoc_edge.cli.localize import georeferenced, sentence
 from ortholoc_edge.config import read_intrinsics
-from ortholoc_edge.errors import ConfigError, MapError
+from ortholoc_edge.errors import ConfigError
 from ortholoc_edge.geometry import frames, rotation
 from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
 from ortholoc_edge.geometry.camera import Camera
@@ -29,11 +30,10 @@ from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.matching.types import Structural
 from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.localizer import Localizer, LocalizerOptions
-from ortholoc_edge.pipeline.locate import Located, locate
+from ortholoc_edge.pipeline.locate import Located, Searchers, locate
 from ortholoc_edge.pipeline.outcome import Fix
 from ortholoc_edge.pipeline.record import outcome_record
-from ortholoc_edge.pipeline.search import Searcher, Sighting, fitting_level
-from ortholoc_edge.tiles.coarse import CoarseField
+from ortholoc_edge.pipeline.search import Searcher, Sighting
 from ortholoc_edge.tiles.lattice import Bounds
 from ortholoc_edge.tiles.pack import Pack
 from ortholoc_edge.tiles.store import MapStore
@@ -41,8 +41,8 @@ from ortholoc_edge.tiles.store import MapStore
 # Of candidates that are told of in JSON.
 _TOLD = 5
 _UNKNOWN_HEADING_DEG = 180.0
-# Pixels of a coarse field: 200 MB.
-_MAX_FIELD_PX = 100e6
+# A computer on a desk has more than one in the air.
+_MAX_FIELD_MB = 1024.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,14 +114,13 @@ def run(args: argparse.Namespace) -> int:
         aided = args.attitude is not None or all(photo.truth is not None for photo in photos)
         reach_deg = 10.0 if aided else _UNKNOWN_HEADING_DEG
     missed = 0
-    searchers: dict[int, Searcher] = {}
-    with MapStore(Pack.open(args.pack)) as store:
-        try:
-            for photo in photos:
-                missed += not _answer(photo, math.radians(reach_deg), store, searchers, args)
-        finally:
-            for searcher in searchers.values():
-                searcher.close()
+    with (
+        MapStore(Pack.open(args.pack)) as store,
+        closing(Searchers(store, args.threads, args.within, _MAX_FIELD_MB)) as searchers,
+    ):
+        told: set[Searcher] = set()
+        for photo in photos:
+            missed += not _answer(photo, math.radians(reach_deg), store, searchers, told, args)
     return 1 if missed else 0
 
 
@@ -149,12 +148,22 @@ def _photos(path: Path, args: argparse.Namespace) -> Iterator[_Photo]:
 
 
 def _answer(
-    photo: _Photo, reach_rad: float, store: MapStore, searchers: dict[int, Searcher], args: argparse.Namespace
+    photo: _Photo,
+    reach_rad: float,
+    store: MapStore,
+    searchers: Searchers,
+    told: set[Searcher],
+    args: argparse.Namespace,
 ) -> bool:
-    """Print what a photo comes to; whether that is a fix."""
+    """Print what a photo comes to; whether that is a fix. ``told``: the searchers that were told of."""
     image = photo.image()
     camera = photo.camera or read_intrinsics(args.intrinsics, image.shape[1], image.shape[0])
-    searcher = _searcher(photo, camera, store, searchers, args)
+    searcher = searchers.suiting(camera, photo.above_ground_m, photo.height_m)
+    if searcher not in told:
+        told.add(searcher)
+        field = searcher.field
+        said = f"{field.known_km2:.1f} km2 at {field.grid.gsd_m:g} m per pixel, {field.bytes / 1e6:.1f} MB"
+        print(said, file=sys.stderr)
     georeference = store.pack.georeference
     west, south, east, north = searcher.field.grid.bounds
     turn = georeference.convergence_rad(np.array([(west + east) / 2, (south + north) / 2]))
@@ -182,36 +191,6 @@ def _answer(
         picture = draw.overlay(image, located.outcome, photo.truth, camera, caption)
         draw.write_png(args.overlay / f"{photo.path.stem}.png", picture)
     return isinstance(located.outcome, Fix)
-
-
-def _searcher(
-    photo: _Photo, camera: Camera, store: MapStore, searchers: dict[int, Searcher], args: argparse.Namespace
-) -> Searcher:
-    """Over the level of the orthophoto that suits the photo's height."""
-    above_m = photo.above_ground_m
-    if not math.isfinite(above_m):
-        tiles = store.pack.manifest.dsm.tiles
-        # The highest ground makes the smallest footprint; a mean one will do.
-        above_m = max(photo.height_m - float(np.median([(tile.min_m + tile.max_m) / 2 for tile in tiles])), 1.0)
-    level = fitting_level(store.dop_grids, camera, above_m)
-    if level not in searchers:
-        grid = store.dop_grids[level]
-        bounds = args.within or store.bounds
-        pixels = (bounds[2] - bounds[0]) * (bounds[3] - bounds[1]) / grid.gsd_m**2
-        if pixels > _MAX_FIELD_PX:
-            raise MapError(
-                f"{photo.path.name}: taken from {above_m:.0f} m, it must be looked for at {grid.gsd_m:g} m per pixel, "
-                f"{pixels / 1e6:.0f} million pixels here, and {_MAX_FIELD_PX / 1e6:.0f} are allowed; give --within"
-            )
-        start = time.monotonic()
-        field = CoarseField.of(store, level, args.within)
-        print(
-            f"{field.known_km2:.1f} km2 at {field.grid.gsd_m:g} m per pixel, {field.bytes / 1e6:.1f} MB, "
-            f"made in {time.monotonic() - start:.1f} s",
-            file=sys.stderr,
-        )
-        searchers[level] = Searcher(field, args.threads)
-    return searchers[level]
 
 
 def _lines(photo: _Photo, located: Located, store: MapStore, took_s: float) -> list[str]:

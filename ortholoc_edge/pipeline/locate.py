@@ -14,14 +14,19 @@ from typing import Annotated, Final
 import numpy as np
 from msgspec import Meta, Struct
 
+from ortholoc_edge.errors import MapError
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import FloatArray
+from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.localizer import Localizer
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.prior import PosePrior
-from ortholoc_edge.pipeline.search import Candidate, Former, Searcher, Sighting, agreeing
+from ortholoc_edge.pipeline.search import Candidate, Former, Searcher, Sighting, agreeing, fitting_level
+from ortholoc_edge.tiles.coarse import CoarseField
+from ortholoc_edge.tiles.lattice import Bounds
+from ortholoc_edge.tiles.store import MapStore
 
 # Of a candidate's place, in pixels of the field, of its heading and of its height above ground: half a step of what was
 # tried, and what relief adds.
@@ -30,6 +35,7 @@ _TURN_SIGMA_RAD: Final = math.radians(2.0)
 _HEIGHT_SIGMA: Final = 0.04
 # Of an attitude that nothing else is said of.
 _TILT_SIGMA_RAD: Final = math.radians(1.0)
+_KEPT_LEVELS: Final = 2
 # Of a frame, that later ones of the flight can make something of.
 _KEPT: Final = 60
 # What candidates of two frames may be apart for the same place: pixels of the field, and a part of how far the vehicle
@@ -76,6 +82,54 @@ class Located:
     tried: list[Outcome]
     lead: float
     own: list[Candidate]
+
+
+class Searchers:
+    """Those of a map, one for each scale of flight, made when it is needed first; the last two are kept. Used by one
+    thread."""
+
+    def __init__(self, store: MapStore, threads: int, within: Bounds | None = None, max_mb: float = 256.0) -> None:
+        """
+        Args:
+            within: (west, south, east, north), m, of the map to look in at all; None: all of it.
+            max_mb: of memory for one.
+        """
+        self._store, self._threads, self._within, self._max_mb = store, threads, within, max_mb
+        self._made: dict[int, Searcher] = {}
+
+    def suiting(self, camera: Camera, above_ground_m: float, height_m: float) -> Searcher:
+        """Over the level of the orthophoto that suits the height of a frame.
+
+        Args:
+            above_ground_m, height_m: as of `Sighting`.
+        Raises: MapError where that level is too large for the memory that is allowed, or there is no map.
+        """
+        store, above_m = self._store, above_ground_m
+        if not math.isfinite(above_m):
+            tiles = store.pack.manifest.dsm.tiles
+            # The highest ground makes the smallest footprint; a mean one will do.
+            above_m = max(height_m - float(np.median([(tile.min_m + tile.max_m) / 2 for tile in tiles])), 1.0)
+        level = fitting_level(store.dop_grids, camera, above_m)
+        if level in self._made:
+            return self._made[level]
+        gsd_m = store.dop_grids[level].gsd_m
+        west, south, east, north = self._within or store.bounds
+        # The field and its half.
+        needed_mb = 2.5 * (east - west) * (north - south) / gsd_m**2 / 1e6
+        if needed_mb > self._max_mb:
+            raise MapError(
+                f"{store.pack.path}: from {above_m:.0f} m it must be searched at {gsd_m:g} m per pixel, which takes "
+                f"{needed_mb:.0f} MB, and {self._max_mb:.0f} are allowed; search a part, fly higher, or allow more"
+            )
+        if len(self._made) == _KEPT_LEVELS:
+            self._made.pop(next(iter(self._made))).close()
+        made = self._made[level] = Searcher(CoarseField.of(store, level, self._within), self._threads)
+        return made
+
+    def close(self) -> None:
+        """End their threads."""
+        for searcher in self._made.values():
+            searcher.close()
 
 
 def locate(

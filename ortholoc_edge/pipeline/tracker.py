@@ -79,8 +79,27 @@ class StartAnew(Struct, frozen=True, kw_only=True, tag="relocalize"):
     trust_gnss: bool
 
 
+class FoundPosition(Struct, frozen=True, kw_only=True, tag="found"):
+    """A search of the map found the vehicle (`pipeline.finder`): go on from there, whatever the chain of fixes says.
+
+    Attributes:
+        stamp_ns: of the frame that was found.
+        position_map_m: of the body then.
+        covariance: (3, 3) of it, m².
+        odometry_ned_m, odometry_epoch: as of that frame's `VehicleState`.
+        why: for people.
+    """
+
+    stamp_ns: int
+    position_map_m: tuple[float, float, float]
+    covariance: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+    odometry_ned_m: tuple[float, float, float] | None
+    odometry_epoch: int
+    why: str
+
+
 # What somebody outside tells the tracker between two frames.
-Order = GivenPosition | StartAnew
+Order = GivenPosition | StartAnew | FoundPosition
 
 
 class TrackerStatus(StrEnum):
@@ -92,7 +111,7 @@ class TrackerStatus(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Anchor:
+class Anchor:
     """Where the body was at the last fix (or where somebody said, or at the last trusted GNSS position), and what the
     odometry said then.
 
@@ -116,6 +135,7 @@ class Tracker:
 
     Attributes:
         witness: whether GNSS agrees with the fixes.
+        anchor: what predictions start from; None: nothing is known.
     """
 
     def __init__(
@@ -137,7 +157,7 @@ class Tracker:
         self._georeference = georeference
         self._fixed_mount = None if body_from_camera is None else CameraMount(body_from_camera)
         self._options = options
-        self._anchor: _Anchor | None = None
+        self.anchor: Anchor | None = None
         self._given: GivenPosition | None = None
         self._last_prior: PosePrior | None = None
         self._gnss_turn = False
@@ -147,8 +167,14 @@ class Tracker:
     def take(self, order: Order) -> None:
         """Act on it with the next `predict`; the fix after it is a new start for the autopilot."""
         self.status = TrackerStatus.SEARCH
-        self._anchor = self._given = None
-        if isinstance(order, GivenPosition):
+        self.anchor = self._given = None
+        if isinstance(order, FoundPosition):
+            covariance, odometry = np.array(order.covariance), order.odometry_ned_m
+            self.anchor = Anchor(
+                order.stamp_ns, np.array(order.position_map_m), covariance, covariance,
+                None if odometry is None else np.array(odometry), order.odometry_epoch, firm=True,
+            )  # fmt: skip
+        elif isinstance(order, GivenPosition):
             self._given = order
         elif order.trust_gnss:
             self.witness.start_anew(order.stamp_ns)
@@ -226,7 +252,7 @@ class Tracker:
         ground = outcome.ground_covariance
         covariance = cov.of_moved_point(outcome.covariance, lever)
         settled = covariance if ground is None else cov.of_moved_point(outcome.covariance - ground, lever)
-        self._anchor = _anchor(state, body.translation, covariance[:3, :3], settled[:3, :3], firm=True)
+        self.anchor = anchor_at(state, body.translation, covariance[:3, :3], settled[:3, :3], firm=True)
         if state.position_map_m is not None:
             both = settled[:2, :2] + np.eye(2) * state.position_sigma_m[0] ** 2
             self.witness.compare(state.stamp_ns, state.position_map_m - body.translation, both)
@@ -241,36 +267,7 @@ class Tracker:
 
     def _carried(self, state: VehicleState) -> tuple[FloatArray, FloatArray] | None:
         """The last fix moved by the odometry since: position and its covariance."""
-        anchor = self._anchor
-        if anchor is None:
-            return None
-        options = self._options
-        elapsed_s = max(state.stamp_ns - anchor.stamp_ns, 0) * 1e-9
-        odometry = state.odometry_ned_m
-        moved = (
-            odometry is not None
-            and anchor.odometry_ned_m is not None
-            and state.odometry_epoch == anchor.odometry_epoch
-            and np.isfinite(odometry).all()
-        )
-        if not moved or odometry is None or anchor.odometry_ned_m is None:
-            horizontal_m = options.unaided_speed_m_per_s * elapsed_s
-            vertical_m = options.unaided_climb_m_per_s * elapsed_s
-            return anchor.position_map_m, anchor.covariance + _axes(horizontal_m, vertical_m)
-        step_ned = odometry - anchor.odometry_ned_m
-        xy = anchor.position_map_m[:2]
-        turn = frames.map_from_ned_rotation(self._georeference.convergence_rad(xy))
-        step = turn @ step_ned
-        step[:2] *= self._georeference.grid_scale(xy, float(anchor.position_map_m[2]))
-        # A constant drift grows with time; a scale or heading error grows with the distance.
-        horizontal_m = math.hypot(
-            options.odometry_ratio * float(np.linalg.norm(step)), options.odometry_drift_m_per_s * elapsed_s
-        )
-        vertical_m = math.hypot(
-            options.climb_ratio * float(step[2]),
-            options.climb_error_m_per_s * _wandered_s(elapsed_s, options.climb_memory_s),
-        )
-        return anchor.position_map_m + step, anchor.covariance + _axes(horizontal_m, vertical_m)
+        return None if self.anchor is None else carried(self.anchor, state, self._options, self._georeference)
 
     def _believed(self, state: VehicleState) -> tuple[FloatArray, FloatArray] | None:
         """Where the autopilot believes to be. Not while GNSS contradicts the fixes: it may have followed a spoofer.
@@ -289,7 +286,7 @@ class Tracker:
         while GNSS is spoofed. They take turns; the first fix decides.
         """
         believed = self._believed(state)
-        if believed is None or self._anchor is None or self._anchor.firm:
+        if believed is None or self.anchor is None or self.anchor.firm:
             return False
         apart = cov.mahalanobis_squared((believed[0] - carried[0])[:2], (believed[1] + carried[1])[:2, :2])
         if apart <= _CONTRADICTION_SIGMAS**2:
@@ -309,7 +306,7 @@ class Tracker:
         elapsed_s = max(state.stamp_ns - given.stamp_ns, 0) * 1e-9
         flown = _axes(self._options.unaided_speed_m_per_s * elapsed_s, self._options.unaided_climb_m_per_s * elapsed_s)
         covariance = _axes(*given.sigma_m) + flown
-        self._anchor = _anchor(state, np.array(given.position_map_m), covariance, covariance, firm=True)
+        self.anchor = anchor_at(state, np.array(given.position_map_m), covariance, covariance, firm=True)
 
     def _take_absolute(self, state: VehicleState) -> None:
         """Anchor at a trusted position of the autopilot's own (GNSS), if it is worth more than what we have.
@@ -327,22 +324,59 @@ class Tracker:
             return
         covariance = _axes(*sigma_m)
         carried = self._carried(state)
-        if carried is not None and self._anchor is not None:
-            settled = carried[1] - self._anchor.covariance + self._anchor.settled
+        if carried is not None and self.anchor is not None:
+            settled = carried[1] - self.anchor.covariance + self.anchor.settled
             if _sigma(settled) <= _sigma(covariance):
                 return
             apart = cov.mahalanobis_squared(position - carried[0], covariance + settled)
-            if self._anchor.firm and apart > _CONTRADICTION_SIGMAS**2:
+            if self.anchor.firm and apart > _CONTRADICTION_SIGMAS**2:
                 return
-        self._anchor = _anchor(state, position, covariance, covariance, firm=False)
+        self.anchor = anchor_at(state, position, covariance, covariance, firm=False)
 
 
-def _anchor(
+def carried(
+    anchor: Anchor, state: VehicleState, options: TrackerOptions, georeference: Georeference
+) -> tuple[FloatArray, FloatArray]:
+    """An anchor moved by the odometry up to a state, which may be an earlier one.
+
+    Returns: position (3,) in the map and its covariance (3, 3).
+    """
+    elapsed_s = abs(state.stamp_ns - anchor.stamp_ns) * 1e-9
+    step = moved_map_m(anchor, state, georeference)
+    if step is None:
+        horizontal_m = options.unaided_speed_m_per_s * elapsed_s
+        vertical_m = options.unaided_climb_m_per_s * elapsed_s
+        return anchor.position_map_m, anchor.covariance + _axes(horizontal_m, vertical_m)
+    # A constant drift grows with time; a scale or heading error grows with the distance.
+    horizontal_m = math.hypot(
+        options.odometry_ratio * float(np.linalg.norm(step)), options.odometry_drift_m_per_s * elapsed_s
+    )
+    vertical_m = math.hypot(
+        options.climb_ratio * float(step[2]),
+        options.climb_error_m_per_s * _wandered_s(elapsed_s, options.climb_memory_s),
+    )
+    return anchor.position_map_m + step, anchor.covariance + _axes(horizontal_m, vertical_m)
+
+
+def moved_map_m(anchor: Anchor, state: VehicleState, georeference: Georeference) -> FloatArray | None:
+    """(3,) how the body has moved in the map since an anchor; None where there is no odometry from there to here."""
+    odometry = state.odometry_ned_m
+    if odometry is None or anchor.odometry_ned_m is None or state.odometry_epoch != anchor.odometry_epoch:
+        return None
+    if not np.isfinite(odometry).all():
+        return None
+    xy = anchor.position_map_m[:2]
+    step = frames.map_from_ned_rotation(georeference.convergence_rad(xy)) @ (odometry - anchor.odometry_ned_m)
+    step[:2] *= georeference.grid_scale(xy, float(anchor.position_map_m[2]))
+    return np.asarray(step)
+
+
+def anchor_at(
     state: VehicleState, position: FloatArray, covariance: FloatArray, settled: FloatArray, firm: bool
-) -> _Anchor:
+) -> Anchor:
     odometry = state.odometry_ned_m
     usable = odometry is not None and bool(np.isfinite(odometry).all())
-    return _Anchor(
+    return Anchor(
         state.stamp_ns, position, covariance, settled, odometry if usable else None, state.odometry_epoch, firm
     )
 

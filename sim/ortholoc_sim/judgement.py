@@ -32,6 +32,7 @@ _S = 1_000_000_000
 # Of the loop's steps: ten in a second.
 _EVERY = 10
 _SETTLE_S = 5.0
+_BACK_M = 10.0
 _NOT_IN_USE = (Verdict.STANDBY, Verdict.TOO_FAST, Verdict.RELATIVE, Verdict.WAITING)
 _TAKEN = (Verdict.FUSED, Verdict.RESET, Verdict.TIMEOUT_RESET)
 RESULT, FRAMES, TRACK, TIMES = "result.json", "frames.jsonl", "track.csv", "times.json"
@@ -59,6 +60,9 @@ class Result(Struct, frozen=True, kw_only=True):
         position_m, horizontal_m, height_m, attitude_deg: errors of the fixes.
         latency_ms: from mid-exposure to the outcome.
         route_m: true horizontal distance from the route after. route_p95_m: its 95th percentile.
+        back_s: from the end of the last fault until the autopilot knew for good where it is, to 10 m; None where there
+            was no fault that ended, or it never did.
+        resets: how often the reset counter changed that the autopilot was told.
         autopilot_m: horizontal error of what the autopilot believes, after. dead_reckoning_m: what it would be at the
             end without fixes; None while it has GNSS.
         verdicts: of the autopilot's filter. fused: share taken in of what arrived while vision was in use.
@@ -90,6 +94,8 @@ class Result(Struct, frozen=True, kw_only=True):
     latency_ms: Spread
     route_m: Spread
     route_p95_m: float | None
+    back_s: float | None
+    resets: int
     autopilot_m: Spread
     autopilot_end_m: float
     dead_reckoning_m: float | None
@@ -179,6 +185,8 @@ def judge(flown: Flown) -> Judged:
         latency_ms=Spread.of([(frame.ready_s - frame.t_s) * 1e3 for frame in flown.frames]),
         route_m=Spread.of(route[after]),
         route_p95_m=float(np.percentile(route[after], 95)) if after.any() else None,
+        back_s=_back_s(flown, t_s, autopilot),
+        resets=sum(a.reset_counter != b.reset_counter for a, b in pairwise(flown.loop.autopilot.vision)),
         autopilot_m=Spread.of(autopilot[after]),
         autopilot_end_m=float(autopilot[-1]),
         dead_reckoning_m=float(reckoned[-1]) if np.isfinite(reckoned[-1]) else None,
@@ -191,6 +199,15 @@ def judge(flown: Flown) -> Judged:
     problems = tuple(_problems(flown, result))
     result = msgspec.structs.replace(result, passed=not problems, problems=problems)
     return Judged(flown, result, errors, t_s, true_map, believed, autopilot, reckoned, route)
+
+
+def _back_s(flown: Flown, t_s: FloatArray, autopilot_m: FloatArray) -> float | None:
+    ended = [fault.until_s for fault in flown.scenario.fault if fault.until_s is not None]
+    after = t_s >= max(ended, default=math.inf)
+    off = np.flatnonzero(after & (autopilot_m > _BACK_M))
+    if not after.any() or (len(off) and off[-1] == len(t_s) - 1):
+        return None
+    return 0.0 if not len(off) else float(t_s[off[-1] + 1] - max(ended))
 
 
 def _errors(frame: FlownFrame) -> Errors | None:
@@ -235,6 +252,11 @@ def _problems(flown: Flown, result: Result) -> Iterator[str]:  # noqa: PLR0912 -
     most = result.autopilot_m.max
     if expect.lost_m is not None and (most is None or most < expect.lost_m):
         yield f"the autopilot was at most {most or 0.0:.1f} m off; it should be lost by {expect.lost_m:g} m"
+    if expect.back_within_s is not None and (result.back_s is None or result.back_s > expect.back_within_s):
+        took = "never" if result.back_s is None else f"after {result.back_s:.1f} s"
+        yield f"after the last fault the autopilot knew {took} where it is; expected within {expect.back_within_s:g} s"
+    if expect.resets is not None and result.resets != expect.resets:
+        yield f"the autopilot was told {result.resets} times that estimates start anew; expected {expect.resets}"
     if result.false_fixes > expect.false_fixes:
         yield f"{result.false_fixes} false fixes; at most {expect.false_fixes}"
     least, greatest = expect.fixed

@@ -13,7 +13,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,9 +28,11 @@ from ortholoc_edge.daemon import Daemon, Localized
 from ortholoc_edge.errors import ConfigError
 from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
 from ortholoc_edge.geometry.rigid import Rigid3
+from ortholoc_edge.pipeline.finder import Answer, Ask
 from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.navigator import TimingOptions
 from ortholoc_edge.pipeline.outcome import Fix, Outcome
+from ortholoc_edge.search_process import MapSeeker, SearchSetup
 from ortholoc_edge.vehicle import STATE_WAIT_NS
 from ortholoc_sim.autopilot import Message
 from ortholoc_sim.line import End, Line, LineTransport
@@ -384,9 +386,12 @@ class _Flight:
         )  # fmt: skip
 
     def _new_daemon(self) -> Daemon:
-        daemon = Daemon(self._config(), frames=_NoFrames(), clock=self._clock)
+        daemon = Daemon(self._config(), frames=_NoFrames(), clock=self._clock, seek_with=self._seeker)
         daemon.navigator.localizer.warm_up()
         return daemon
+
+    def _seeker(self, setup: SearchSetup) -> _Seeker:
+        return _Seeker(setup, self._clock, round(self.scenario.latency.search_ms * _MS))
 
     def _arrived(self) -> bool:
         if not self._until_arrival or not self._loop.on_last_leg:
@@ -480,10 +485,36 @@ class _Flight:
             tracker=scenario.tracker,
             witness=scenario.witness,
             attitude=scenario.attitude,
+            search=scenario.search,
             # No budget: the ladder of detail goes by wall time, which is not the same twice.
             timing=TimingOptions(max_age_ms=scenario.timing.max_age_ms, budget_ms=math.inf),
             log=self._log,
         )
+
+
+class _Seeker:
+    """Searches at once, and has the answer when the scenario's time for it has passed."""
+
+    def __init__(self, setup: SearchSetup, clock: ManualClock, took_ns: int) -> None:
+        self._seeker, self._clock, self._took_ns = MapSeeker(setup), clock, took_ns
+        self._answer: tuple[int, Answer] | None = None
+
+    @property
+    def idle(self) -> bool:
+        return self._answer is None
+
+    def ask(self, ask: Ask) -> None:
+        answer = replace(self._seeker.answer(ask), took_s=self._took_ns / _S)
+        self._answer = self._clock.now_ns() + self._took_ns, answer
+
+    def take(self) -> Answer | None:
+        if self._answer is None or self._clock.now_ns() < self._answer[0]:
+            return None
+        answer, self._answer = self._answer[1], None
+        return answer
+
+    def close(self) -> None:
+        self._seeker.close()
 
 
 class _NoFrames:

@@ -17,6 +17,7 @@ from msgspec import Meta, Struct, field
 from ortholoc_edge.adapters.mavlink import LinkOptions
 from ortholoc_edge.config import AttitudeOptions, Intrinsics, MatcherOptions, MountOptions
 from ortholoc_edge.errors import ConfigError
+from ortholoc_edge.pipeline.finder import SearchOptions
 from ortholoc_edge.pipeline.outcome import Reason
 from ortholoc_edge.pipeline.tracker import TrackerOptions
 from ortholoc_edge.pipeline.witness import WitnessOptions
@@ -192,6 +193,7 @@ class AutopilotTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     stamps: Literal["timesync", "jitter"] = "jitter"
     viso_delay_ms: Annotated[float, Meta(ge=0, le=250)] = 10.0
     yaw_error_deg: float = 2.0
+    acceleration_bias: Annotated[float, Meta(ge=0)] = SensorOptions().acceleration_bias
     system_id: Annotated[int, Meta(ge=1, le=255)] = 1
 
     def __post_init__(self) -> None:
@@ -204,7 +206,7 @@ class AutopilotTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             seed=seed,
             system_id=self.system_id,
             firmware=self.firmware or (*oldest_and_newest[1], 0),
-            sensors=SensorOptions(yaw_bias_deg=self.yaw_error_deg),
+            sensors=SensorOptions(yaw_bias_deg=self.yaw_error_deg, acceleration_bias=self.acceleration_bias),
             filter=FilterOptions(
                 stamps="timesync" if self.stack == "px4" else self.stamps,
                 viso_delay_ms=self.viso_delay_ms,
@@ -219,11 +221,13 @@ class AutopilotTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 class LatencyTable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """``[latency]``: how long the simulated computer takes for a frame: log-normal. The defaults are like the measured
-    ones of docs/benchmarks.md; ``hypothesis_ms``: for each further place that a search tries."""
+    ones of docs/benchmarks.md; ``hypothesis_ms``: for each further place that a prior allows; ``search_ms``: of the
+    whole map, beside the frames."""
 
     median_ms: Positive = 180.0
     p99_ms: Positive = 420.0
     hypothesis_ms: Annotated[float, Meta(ge=0)] = 60.0
+    search_ms: Annotated[float, Meta(ge=0)] = 3000.0
 
     def __post_init__(self) -> None:
         if self.p99_ms < self.median_ms:
@@ -275,6 +279,9 @@ class Expectations(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     Attributes:
         route_p95_m: limit of the true horizontal distance from the route, 95th percentile, since the first GNSS event.
         lost_m: the vehicle must have been at least so far from where it believed it was.
+        back_within_s: after the last fault has ended the autopilot must know within so long where it is, to 10 m, and
+            for good.
+        resets: how often the autopilot must be told that estimates start anew; the first one counts for nothing.
         false_fixes: most of them.
         fixed: least and most share of the frames that give a fix.
         nees: least and most of the mean NEES over its degrees of freedom.
@@ -285,6 +292,8 @@ class Expectations(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     route_p95_m: Positive | None = None
     lost_m: Positive | None = None
+    back_within_s: Positive | None = None
+    resets: Annotated[int, Meta(ge=0)] | None = None
     false_fixes: Annotated[int, Meta(ge=0)] = 0
     fixed: tuple[Annotated[float, Meta(ge=0, le=1)], Annotated[float, Meta(ge=0, le=1)]] = (0.0, 1.0)
     nees: tuple[Annotated[float, Meta(ge=0)], Annotated[float, Meta(gt=0)]] | None = None
@@ -301,6 +310,7 @@ class Scenario(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     Attributes:
         name: of the file. title: one line for people.
         fixes: whether the companion works at all; False shows what becomes of the flight without it.
+        search: of the daemon; off unless a file says otherwise, so that each flight shows what the tracker does alone.
     """
 
     name: str
@@ -323,6 +333,7 @@ class Scenario(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     tracker: TrackerOptions = field(default_factory=TrackerOptions)
     witness: WitnessOptions = field(default_factory=WitnessOptions)
     attitude: AttitudeOptions = field(default_factory=AttitudeOptions)
+    search: SearchOptions = field(default_factory=lambda: SearchOptions(enabled=False))
     gnss: tuple[GnssEvent, ...] = ()
     fault: tuple[Fault, ...] = ()
     expect: Expectations = field(default_factory=Expectations)
