@@ -230,6 +230,7 @@ class Daemon:
             structs.replace(config.localizer, precomputed_features="never", calibrate=False),
             config.search.threads,
             config.search.max_mb,
+            config.map.memory_mb * 2**20,
         )
         tracker, georeference = self._navigator.tracker, self._store.pack.georeference
         seeker = seek_with(setup)

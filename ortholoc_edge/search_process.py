@@ -50,8 +50,8 @@ class SearchSetup:
     Attributes:
         camera: of the pictures that it is sent.
         options: of its localizer; precomputed features are of no use to it.
-        cache_bytes: of the map's pixels that it keeps.
         max_mb: as of `SearchOptions`.
+        memory_bytes, cache_bytes: as of `MapStore`.
     """
 
     pack: Path
@@ -60,6 +60,7 @@ class SearchSetup:
     options: LocalizerOptions
     threads: int
     max_mb: int
+    memory_bytes: int
     cache_bytes: int = 16 * 2**20
 
 
@@ -69,7 +70,10 @@ class MapSeeker:
     def __init__(self, setup: SearchSetup) -> None:
         """Raises: MapError for a pack that can't be read."""
         self._store = MapStore(
-            Pack.open(setup.pack, setup.public_key), cache_bytes=setup.cache_bytes, memory_bytes=0, features=False
+            Pack.open(setup.pack, setup.public_key),
+            cache_bytes=setup.cache_bytes,
+            memory_bytes=setup.memory_bytes,
+            features=False,
         )
         self._localizer = Localizer(setup.camera, self._store, Structural(), setup.options)
         self._searchers = Searchers(self._store, setup.threads, max_mb=setup.max_mb)

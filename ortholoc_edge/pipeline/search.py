@@ -42,8 +42,8 @@ _APART_PX: Final = 8
 _PER_BLOCK: Final = 8
 # Places found at half the scale that are looked at again at full scale.
 _LOOKED_AT: Final = 150
-# Templates of a block are held in memory at a time: 2 MB each at 512 px.
-_AT_A_TIME: Final = 12
+# Headings for which templates are held in memory at a time: 0.5 MB for each and each height above ground.
+_TURNS_AT_A_TIME: Final = 4
 # Of the map's mean energy: where there is less, a frame that fits well does so by chance.
 _LEAST_ENERGY: Final = 0.3
 
@@ -205,17 +205,24 @@ class Searcher:
     def _everywhere(self, sighting: Sighting, scale: _Scale, within: FloatArray | None) -> list[Candidate]:
         found: list[Candidate] = []
         turns = _turns(sighting.heading_reach_rad, scale.turn_rad)
-        for above_m, blocks in _heights(sighting, scale, within):
-            tried = [(above_m * zoom, turn_rad) for zoom in _zooms(sighting.height_reach) for turn_rad in turns]
-            for first in range(0, len(tried), _AT_A_TIME):
-                made = self._pool.map(lambda pair: _template(sighting, scale, *pair), tried[first : first + _AT_A_TIME])
-                templates = [template for template in made if template is not None]
-                if not templates:
-                    continue
-                for part in self._pool.map(
-                    lambda block, those=templates: _search_block(scale, block, those, _PER_BLOCK), blocks
-                ):
-                    found += part
+        zooms = _zooms(sighting.height_reach)
+        tasks = list(_tasks(sighting, scale, within))
+        heights = sorted({above_m for _, tries in tasks for above_m, _ in tries})
+        for first in range(0, len(turns), _TURNS_AT_A_TIME):
+            some = turns[first : first + _TURNS_AT_A_TIME]
+            wanted = [(above_m, above_m * zoom, turn) for above_m in heights for zoom in zooms for turn in some]
+            made = self._pool.map(lambda one: _template(sighting, scale, one[1], one[2]), wanted)
+            templates: dict[float, list[_Template]] = {above_m: [] for above_m in heights}
+            for (above_m, _, _), template in zip(wanted, made, strict=True):
+                if template is not None:
+                    templates[above_m].append(template)
+            for part in self._pool.map(
+                lambda task, those=templates: _search_block(
+                    scale, task[0], [(those[above_m], band) for above_m, band in task[1]], _PER_BLOCK
+                ),
+                tasks,
+            ):
+                found += part
         return found
 
 
@@ -243,7 +250,7 @@ class _Near:
         tried = [self._template(scale, above_m, turn_rad) for turn_rad in turns]
         templates = [template for template in tried if template is not None]
         block = _Block(column - side // 2, row - side // 2, side, self._within)
-        return _search_block(scale, block, templates, 1) if templates else []
+        return _search_block(scale, block, [(templates, None)], 1)
 
     def _template(self, scale: _Scale, above_m: float, turn_rad: float) -> _Template | None:
         key = above_m, round(turn_rad, 6)
@@ -343,18 +350,22 @@ class _Block:
 
     Attributes:
         within: as of `Searcher.search`.
-        heights: of the ground that counts there, from and to, m; None: any.
     """
 
     column: int
     row: int
     side: int
     within: FloatArray | None = None
-    heights: tuple[float, float] | None = None
 
 
-def _heights(sighting: Sighting, scale: _Scale, within: FloatArray | None) -> Iterator[tuple[float, list[_Block]]]:
-    """Heights above ground to look from, and the blocks of the map that each holds in."""
+# Heights of the ground from and to, m, that a height above ground is right for; None: any.
+_Band = tuple[float, float] | None
+
+
+def _tasks(
+    sighting: Sighting, scale: _Scale, within: FloatArray | None
+) -> Iterator[tuple[_Block, list[tuple[float, _Band]]]]:
+    """Blocks of the map, and the heights above ground that each is to be searched for."""
     # A camera of a block needs the ground around it, up to half a canvas and more where it looks aslant.
     field, side = scale.field, scale.block_px - 2 * _margin_px(sighting, scale.field, scale.halving)
     left, upper, right, lower = 0, 0, field.grid.width, field.grid.height
@@ -362,29 +373,25 @@ def _heights(sighting: Sighting, scale: _Scale, within: FloatArray | None) -> It
         px = field.grid.px_from_map(within)
         left, upper = np.maximum(np.floor(px.min(axis=0)).astype(int), 0).tolist()
         right, lower = np.minimum(np.ceil(px.max(axis=0)).astype(int) + 1, (right, lower)).tolist()
-    blocks = [
-        _Block(column, row, side, within) for row in range(upper, lower, side) for column in range(left, right, side)
-    ]
-    if math.isfinite(sighting.above_ground_m):
-        yield sighting.above_ground_m, blocks
-        return
-    by_step: dict[int, list[_Block]] = {}
-    for block in blocks:
-        for step, heights in _steps(sighting, field, block):
-            by_step.setdefault(step, []).append(replace(block, heights=heights))
-    for step in sorted(by_step):
-        yield _ZOOM**step, by_step[step]
+    for row in range(upper, lower, side):
+        for column in range(left, right, side):
+            block = _Block(column, row, side, within)
+            if math.isfinite(sighting.above_ground_m):
+                yield block, [(sighting.above_ground_m, None)]
+            else:
+                yield block, list(_steps(sighting, field, block))
 
 
-def _steps(sighting: Sighting, field: CoarseField, block: _Block) -> Iterator[tuple[int, tuple[float, float]]]:
-    """Steps of height above ground that a block's ground asks for, each with the ground that it is right for."""
+def _steps(sighting: Sighting, field: CoarseField, block: _Block) -> Iterator[tuple[float, _Band]]:
+    """Heights above ground that a block's ground asks for, each with the ground that it is right for."""
     place = field.grid.crop(block.column, block.row, block.side, block.side)
     around = np.stack(np.meshgrid(np.arange(0, block.side, 8), np.arange(0, block.side, 8)), axis=-1).reshape(-1, 2)
     ground = field.ground_m(place.map_from_px(around))
     above = sighting.height_m - ground[np.isfinite(ground)]
     steps = np.unique(np.round(np.log(above[above > 1.0]) / math.log(_ZOOM)).astype(int))
     for step in steps.tolist():
-        yield step, (sighting.height_m - _ZOOM ** (step + 0.6), sighting.height_m - _ZOOM ** (step - 0.6))
+        low_m, high_m = (sighting.height_m - _ZOOM ** (step + half) for half in (0.6, -0.6))
+        yield _ZOOM**step, (low_m, high_m)
 
 
 def _margin_px(sighting: Sighting, field: CoarseField, halving: int) -> int:
@@ -401,8 +408,10 @@ def _margin_px(sighting: Sighting, field: CoarseField, halving: int) -> int:
     return min(math.ceil(reach) + 3, _MAX_CANVAS_PX // halving)
 
 
-def _search_block(scale: _Scale, block: _Block, templates: Sequence[_Template], count: int) -> list[Candidate]:
-    """The ``count`` best places of a block, with the template that fits best at each."""
+def _search_block(
+    scale: _Scale, block: _Block, tries: Sequence[tuple[Sequence[_Template], _Band]], count: int
+) -> list[Candidate]:
+    """The ``count`` best places of a block for each of the ``tries``, with the template that fits best at each."""
     field, block_px = scale.field, scale.block_px
     margin = (block_px - block.side) // 2
     values = field.block(block.column - margin, block.row - margin, block_px)
@@ -411,38 +420,46 @@ def _search_block(scale: _Scale, block: _Block, templates: Sequence[_Template], 
     if not squares.any():
         return []
     spectra = [np.asarray(cv2.dft(part)) for part in values]
-    best = np.full((block.side, block.side), -np.inf, np.float32)
-    which = np.zeros(best.shape, np.int16)
-    for number, template in enumerate(templates):
-        product = cv2.mulSpectrums(spectra[0], template.spectra[0], 0, conjB=True)
-        cv2.add(product, cv2.mulSpectrums(spectra[1], template.spectra[1], 0, conjB=True), dst=product)
-        correlation = cv2.dft(product, flags=cv2.DFT_INVERSE | cv2.DFT_REAL_OUTPUT | cv2.DFT_SCALE)
-        x, y = template.foot_px
-        # The correlation is for the canvas' corner: the camera is at its foot.
-        here = correlation[margin - y : margin - y + block.side, margin - x : margin - x + block.side]
-        better = here > best
-        np.copyto(best, here, where=better)
-        which[better] = number
-    # The frame's shape is a turned one of many: a square of its size is near enough.
-    side = round(math.sqrt(float(np.mean([template.pixels for template in templates]))))
-    energy = cv2.boxFilter(squares, -1, (side, side), borderType=cv2.BORDER_CONSTANT)[inner, inner]
-    score = best / np.sqrt(np.maximum(energy, _LEAST_ENERGY * float(squares[squares > 0].mean())))
-    if block.heights is not None:
-        score[~_in_band(field, block)] = -np.inf
-    if block.within is not None:
-        score[~_inside(field, block)] = -np.inf
-    return list(_peaks(score, which, templates, field, block, count))
+    least = _LEAST_ENERGY * float(squares[squares > 0].mean())
+    inside = None if block.within is None else _inside(field, block)
+    ground = _ground(field, block) if any(band is not None for _, band in tries) else np.empty(0)
+    found: list[Candidate] = []
+    for templates, band in tries:
+        if not templates:
+            continue
+        fits = [_fit(spectra, template, margin, block.side) for template in templates]
+        score = fits[0].copy()
+        for fit in fits[1:]:
+            np.maximum(score, fit, out=score)
+        # The frame's shape is a turned one of many: a square of its size is near enough.
+        side = round(math.sqrt(float(np.mean([template.pixels for template in templates]))))
+        energy = cv2.boxFilter(squares, -1, (side, side), borderType=cv2.BORDER_CONSTANT)[inner, inner]
+        score /= np.sqrt(np.maximum(energy, least))
+        if band is not None:
+            low, high = band
+            score[~((ground >= low) & (ground <= high))] = -np.inf
+        if inside is not None:
+            score[~inside] = -np.inf
+        found += _peaks(score, fits, templates, field, block, count)
+    return found
 
 
-def _in_band(field: CoarseField, block: _Block) -> BoolArray:
-    assert block.heights is not None
+def _fit(spectra: Sequence[np.ndarray], template: _Template, margin: int, side: int) -> Float32Array:
+    """(side, side) correlation of a template with a block, for the camera above each of its pixels."""
+    product = cv2.mulSpectrums(spectra[0], template.spectra[0], 0, conjB=True)
+    cv2.add(product, cv2.mulSpectrums(spectra[1], template.spectra[1], 0, conjB=True), dst=product)
+    correlation = cv2.dft(product, flags=cv2.DFT_INVERSE | cv2.DFT_REAL_OUTPUT | cv2.DFT_SCALE)
+    x, y = template.foot_px
+    # The correlation is for the canvas' corner: the camera is at its foot.
+    return np.asarray(correlation[margin - y : margin - y + side, margin - x : margin - x + side], dtype=np.float32)
+
+
+def _ground(field: CoarseField, block: _Block) -> FloatArray:
+    """(side, side) heights of the ground below, every eighth pixel's for those after it."""
     place = field.grid.crop(block.column, block.row, block.side, block.side)
     coarse = np.arange(0.0, block.side + 8.0, 8.0)
     ground = field.ground_m(place.map_from_px(np.stack(np.meshgrid(coarse, coarse), axis=-1).reshape(-1, 2)))
-    low, high = block.heights
-    with np.errstate(invalid="ignore"):
-        inside = (ground >= low) & (ground <= high)
-    wide = np.repeat(np.repeat(inside.reshape(len(coarse), -1), 8, axis=0), 8, axis=1)
+    wide = np.repeat(np.repeat(ground.reshape(len(coarse), -1), 8, axis=0), 8, axis=1)
     return np.asarray(wide[: block.side, : block.side])
 
 
@@ -456,7 +473,7 @@ def _inside(field: CoarseField, block: _Block) -> BoolArray:
 
 def _peaks(
     score: Float32Array,
-    which: np.ndarray,
+    fits: Sequence[Float32Array],
     templates: Sequence[_Template],
     field: CoarseField,
     block: _Block,
@@ -467,7 +484,7 @@ def _peaks(
         value = float(score[row, column])
         if not value > 0.0:
             return
-        template = templates[int(which[row, column])]
+        template = templates[int(np.argmax([fit[row, column] for fit in fits]))]
         easting, northing = field.grid.map_from_px((block.column + column, block.row + row)).tolist()
         yield Candidate(easting, northing, template.above_ground_m, template.turn_rad, value)
         score[max(row - _APART_PX, 0) : row + _APART_PX + 1, max(column - _APART_PX, 0) : column + _APART_PX + 1] = -1.0
