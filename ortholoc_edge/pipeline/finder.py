@@ -24,7 +24,15 @@ from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.pipeline.frame import CameraMount, Frame, VehicleState
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.search import Candidate, Former, Sighting, circle
-from ortholoc_edge.pipeline.tracker import Anchor, FoundPosition, Tracker, TrackerOptions, carried, moved_map_m
+from ortholoc_edge.pipeline.tracker import (
+    LOST_DRIFT_M_PER_S,
+    Anchor,
+    FoundPosition,
+    Tracker,
+    TrackerOptions,
+    carried,
+    moved_map_m,
+)
 from ortholoc_edge.tiles.georeference import Georeference
 
 _S = 1_000_000_000
@@ -35,7 +43,7 @@ _LEAST_HEADING_RAD: Final = math.radians(10.0)
 # the last, it says nothing.
 _SAME_SIGMAS: Final = 3.0
 _SAME_M: Final = 3.0
-_SAYS_NOTHING_M: Final = 100.0
+_SAYS_NOTHING_M: Final = 200.0
 # What the last known place may be off, beyond how far the vehicle can have come.
 _AREA_SIGMAS: Final = 4.0
 _AREA_M: Final = 100.0
@@ -347,8 +355,9 @@ class Finder:
         moved = cov.of_moved_point(fix.covariance, map_from_body.translation - fix.map_from_camera.translation)
         state, position, covariance = asked.state, map_from_body.translation, moved[:3, :3]
         place = Anchor(
-            state.stamp_ns, position, covariance, covariance, state.odometry_ned_m, state.odometry_epoch, firm=True
-        )
+            state.stamp_ns, position, covariance, covariance, state.odometry_ned_m, state.odometry_epoch, firm=True,
+            drift_m_per_s=LOST_DRIFT_M_PER_S,
+        )  # fmt: skip
         anchor = self._tracker.anchor
         if not lost and anchor is not None and self._same(anchor, place, state):
             self._hypothesis, self.says = None, "the search finds the track's place"

@@ -71,7 +71,7 @@ class Located:
 
     Attributes:
         outcome: the fix, or why there is none.
-        candidates: of the search, with what earlier frames say of them, the best first.
+        candidates: of the search, the best first; with what earlier frames say of them, where they decided.
         own: of the frame alone: what a later one wants to know of it.
         tried: what the localizer said of the first of them, as many as it was asked about.
         lead: score of the place that is meant, over that of the best other one; 0 where there is none.
@@ -153,27 +153,54 @@ def locate(
     """
     options = options or LocateOptions()
     own = searcher.search(sighting, _KEPT, within)
-    tried: list[Outcome] = []
     if not own:
         why = "the frame shows too little ground, or nothing on it, for the map's coarse scale"
-        return Located(Rejected(frame.stamp_ns, Reason.FEW_MATCHES, why), own, tried, 0.0, own)
-    moved_m = max((float(np.linalg.norm(one.moved_m)) for one in former), default=0.0)
-    candidates = agreeing(own, former, _AGREE_PX * searcher.field.grid.gsd_m + _AGREE_RATIO * moved_m)
+        return Located(Rejected(frame.stamp_ns, Reason.FEW_MATCHES, why), own, [], 0.0, own)
+    seen: dict[Candidate, Outcome] = {}
+
+    def look(candidate: Candidate) -> Outcome:
+        # The same place, whatever the sequence makes of its score.
+        key = replace(candidate, score=0.0)
+        if key not in seen:
+            prior = _prior(candidate, sighting, searcher)
+            if prior is None:
+                why = "the surface model has no data there"
+                seen[key] = Rejected(frame.stamp_ns, Reason.MAP_NODATA, why)
+            else:
+                seen[key] = localizer.localize(frame, prior)
+        return seen[key]
+
+    alone = _looked_at(frame.stamp_ns, own, own, look, options, proceed)
+    if not former or isinstance(alone.outcome, Fix) or not proceed():
+        return alone
+    # What is known of the motion may be wrong: a frame that tells by itself needs none of it.
+    moved_m = max(float(np.linalg.norm(one.moved_m)) for one in former)
+    together = agreeing(own, former, _AGREE_PX * searcher.field.grid.gsd_m + _AGREE_RATIO * moved_m)
+    sequence = _looked_at(frame.stamp_ns, together, own, look, options, proceed)
+    return sequence if isinstance(sequence.outcome, Fix) else alone
+
+
+def _looked_at(
+    stamp_ns: int,
+    candidates: list[Candidate],
+    own: list[Candidate],
+    look: Callable[[Candidate], Outcome],
+    options: LocateOptions,
+    proceed: Callable[[], bool],
+) -> Located:
+    """What the best candidates come to, at least one of them, when the localizer looks."""
+    tried: list[Outcome] = []
     for candidate in candidates[: options.candidates]:
         if candidate.score < options.near_best * candidates[0].score:
             break
         if not proceed():
-            late = Rejected(frame.stamp_ns, Reason.LATE, f"{len(tried)} of {len(candidates)} places were looked at")
+            late = Rejected(stamp_ns, Reason.LATE, f"{len(tried)} of {len(candidates)} places were looked at")
             return Located(late, candidates, tried, 0.0, own)
-        prior = _prior(candidate, sighting, searcher)
-        if prior is None:
-            tried.append(Rejected(frame.stamp_ns, Reason.MAP_NODATA, "the surface model has no data there"))
-            continue
-        tried.append(localizer.localize(frame, prior))
+        tried.append(look(candidate))
         alone = len(candidates) == 1 or candidates[0].score >= options.sure_lead * candidates[1].score
         if alone and isinstance(_enough(tried[0], options), Fix):
             break
-    outcome, lead = judged(frame.stamp_ns, candidates, tried, options)
+    outcome, lead = judged(stamp_ns, candidates, tried, options)
     return Located(outcome, candidates, tried, lead, own)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Annotated
 
@@ -20,6 +20,10 @@ from ortholoc_edge.pipeline.prior import PosePrior
 from ortholoc_edge.pipeline.witness import Witness, WitnessOptions
 from ortholoc_edge.tiles.georeference import Georeference
 
+# What the odometry may err, horizontal 1-sigma, of a vehicle that was lost: it is by it that it was.
+LOST_DRIFT_M_PER_S = 5.0
+# With each fix that the odometry agrees with it is believed to err by half of that.
+_DRIFT_FORGOTTEN = 0.5
 # Between GNSS and the chain of fixes, over position.
 _CONTRADICTION_SIGMAS = 4.0
 
@@ -115,6 +119,9 @@ class Anchor:
     """Where the body was at the last fix (or where somebody said, or at the last trusted GNSS position), and what the
     odometry said then.
 
+    ``drift_m_per_s``: what the odometry may err from there on, horizontal 1-sigma, where that is more than it should:
+    it has carried the vehicle away before, and until fixes agree with it again it is not to be believed.
+
     ``firm``: GNSS that contradicts it does not take its place.
 
     ``settled`` is the covariance without the fix's `Fix.ground_covariance`: GNSS is judged by that. Over a wood it
@@ -128,6 +135,7 @@ class Anchor:
     odometry_ned_m: FloatArray | None
     odometry_epoch: int
     firm: bool
+    drift_m_per_s: float = 0.0
 
 
 class Tracker:
@@ -173,6 +181,7 @@ class Tracker:
             self.anchor = Anchor(
                 order.stamp_ns, np.array(order.position_map_m), covariance, covariance,
                 None if odometry is None else np.array(odometry), order.odometry_epoch, firm=True,
+                drift_m_per_s=LOST_DRIFT_M_PER_S,
             )  # fmt: skip
         elif isinstance(order, GivenPosition):
             self._given = order
@@ -252,11 +261,24 @@ class Tracker:
         ground = outcome.ground_covariance
         covariance = cov.of_moved_point(outcome.covariance, lever)
         settled = covariance if ground is None else cov.of_moved_point(outcome.covariance - ground, lever)
-        self.anchor = anchor_at(state, body.translation, covariance[:3, :3], settled[:3, :3], firm=True)
+        drift_m_per_s = self._drift_seen(state, body.translation)
+        anchor = anchor_at(state, body.translation, covariance[:3, :3], settled[:3, :3], firm=True)
+        self.anchor = replace(anchor, drift_m_per_s=drift_m_per_s)
         if state.position_map_m is not None:
             both = settled[:2, :2] + np.eye(2) * state.position_sigma_m[0] ** 2
             self.witness.compare(state.stamp_ns, state.position_map_m - body.translation, both)
         self.status = TrackerStatus.TRACK
+
+    def _drift_seen(self, state: VehicleState, position: FloatArray) -> float:
+        """What the odometry may err after a fix, see `Anchor`, by what it did before it."""
+        anchor, least = self.anchor, self._options.odometry_drift_m_per_s
+        if anchor is None or anchor.drift_m_per_s <= least:
+            return 0.0
+        carried_to = carried(anchor, state, self._options, self._georeference)[0]
+        elapsed_s = max(abs(state.stamp_ns - anchor.stamp_ns) * 1e-9, 1e-3)
+        seen = float(np.linalg.norm((position - carried_to)[:2])) / elapsed_s
+        drift = max(_DRIFT_FORGOTTEN * anchor.drift_m_per_s, min(seen, 2.0 * LOST_DRIFT_M_PER_S))
+        return drift if drift > least else 0.0
 
     def _jumped(self, fix: Fix) -> bool:
         if self._last_prior is None:
@@ -348,9 +370,8 @@ def carried(
         vertical_m = options.unaided_climb_m_per_s * elapsed_s
         return anchor.position_map_m, anchor.covariance + _axes(horizontal_m, vertical_m)
     # A constant drift grows with time; a scale or heading error grows with the distance.
-    horizontal_m = math.hypot(
-        options.odometry_ratio * float(np.linalg.norm(step)), options.odometry_drift_m_per_s * elapsed_s
-    )
+    drift = max(options.odometry_drift_m_per_s, anchor.drift_m_per_s)
+    horizontal_m = math.hypot(options.odometry_ratio * float(np.linalg.norm(step)), drift * elapsed_s)
     vertical_m = math.hypot(
         options.climb_ratio * float(step[2]),
         options.climb_error_m_per_s * _wandered_s(elapsed_s, options.climb_memory_s),
