@@ -78,7 +78,7 @@ class SearchOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     ``lost_after_s``: without a fix for so long, and without GNSS, it searches without a break.
     ``duty``: part of the time that it searches otherwise, to hold what it finds against the track; 0: not at all.
     ``agreements``: so many searches in a row, of different frames, must find the same place before a vehicle that is
-        lost goes on from there.
+        lost goes on from there; those that find nothing do not count.
     ``against``: and so many, before a track that still has fixes is dropped for it.
     ``max_speed_m_per_s``: over ground; so far from the last known place a vehicle that is lost is looked for.
     ``max_mb``: of memory for the edges of the map that are looked through; what needs more is not searched.
