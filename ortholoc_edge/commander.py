@@ -12,19 +12,31 @@ from pathlib import Path
 
 import cv2
 import msgspec
+import numpy as np
 
 from ortholoc_edge.adapters.commands import Answer
 from ortholoc_edge.adapters.flight_log import FlightLog, LoggedStep
 from ortholoc_edge.adapters.mavlink import AutopilotLink, Severity
-from ortholoc_edge.adapters.messages import Command, CommandReply, Pause, Relocalize, Resume, SetPrior, Statistic
+from ortholoc_edge.adapters.messages import (
+    Command,
+    CommandReply,
+    Pause,
+    Relocalize,
+    Resume,
+    SearchFor,
+    SetPrior,
+    Statistic,
+)
 from ortholoc_edge.clock import Clock, wall_clock_ns
 from ortholoc_edge.errors import MapError
-from ortholoc_edge.geometry.arrays import ImageArray
+from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
+from ortholoc_edge.pipeline.finder import Finder
 from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.navigator import Navigator
 from ortholoc_edge.pipeline.outcome import Outcome
 from ortholoc_edge.pipeline.record import frame_record, outcome_record
 from ortholoc_edge.pipeline.tracker import GivenPosition, StartAnew
+from ortholoc_edge.tiles.lattice import Bounds
 from ortholoc_edge.tiles.store import MapStore
 
 logger = logging.getLogger(__name__)
@@ -32,6 +44,7 @@ logger = logging.getLogger(__name__)
 _S = 1_000_000_000
 # Of a megabyte or less each: who needs more wants a flight log with all frames.
 _MOST_SNAPSHOTS = 100
+_LEAST_AREA_M2 = 1000.0
 # For a typical height of the ground.
 _GROUND_GSD_M = 4.0
 
@@ -54,17 +67,19 @@ class Commander:
         statistics: Callable[[], dict[str, Statistic]],
         *,
         lost_sigma_m: float,
+        finder: Finder | None,
         log: FlightLog | None,
         snapshots: Path | None,
     ) -> None:
         """
         Args:
             counts: of the owner, to which ``commands`` is added.
+            finder: that searches the map; None: it is switched off.
             snapshots: folder for them; None: nowhere.
         """
         self._navigator, self._store, self._link, self._clock = navigator, store, link, clock
         self._counts, self._statistics = counts, statistics
-        self._log, self._snapshots = log, snapshots
+        self._finder, self._log, self._snapshots = finder, log, snapshots
         self._last: tuple[Frame, Outcome, LoggedStep | None] | None = None
         self.lost_sigma_m = lost_sigma_m
         self.paused = False
@@ -82,6 +97,8 @@ class Commander:
                 answer = self._relocalize(command, now_ns)
             case SetPrior():
                 answer = self._set_prior(command, now_ns)
+            case SearchFor():
+                answer = self._search(command, now_ns)
             case Pause():
                 answer = self._pause(paused=True)
             case Resume():
@@ -140,6 +157,26 @@ class Commander:
         )
         return CommandReply(command="set_prior", accepted=True)
 
+    def _search(self, command: SearchFor, now_ns: int) -> CommandReply:
+        if self._finder is None:
+            return _refused("search", "the search is switched off", "set [search] enabled in the configuration")
+        corners: FloatArray | None = None
+        if command.polygon is not None:
+            try:
+                corners = np.array(
+                    [
+                        self._store.pack.georeference.map_from_geodetic(lat, lon, height_amsl_m=0.0)[:2]
+                        for lat, lon in command.polygon
+                    ]
+                )
+            except MapError as error:
+                return _refused("search", str(error), "send corners near the pack")
+            why = unusable_area(corners, self._store.bounds)
+            if why is not None:
+                return _refused("search", why, "send the corners in order, (latitude, longitude), over the pack")
+        self._finder.search_in(corners, now_ns)
+        return CommandReply(command="search", accepted=True)
+
     def _pause(self, *, paused: bool) -> CommandReply:
         name = "pause" if paused else "resume"
         if self.paused == paused:
@@ -165,6 +202,39 @@ class Commander:
         )
         folder = self._snapshots
         return lambda: _write_snapshot(folder, frame.image, content)
+
+
+def unusable_area(corners: FloatArray, bounds: Bounds) -> str | None:
+    """Why a polygon (N, 2) is none to search in; None where it is one.
+
+    Args:
+        bounds: of the map.
+    """
+    west, south, east, north = bounds
+    if (corners.max(axis=0) <= (west, south)).any() or (corners.min(axis=0) >= (east, north)).any():
+        return "the polygon is outside of the pack"
+    ends = np.roll(corners, -1, axis=0)
+    for i in range(len(corners)):
+        for j in range(i + 2, len(corners)):
+            # The first and the last have a corner in common.
+            if not (i == 0 and j == len(corners) - 1) and _cross(corners[i], ends[i], corners[j], ends[j]):
+                return f"the polygon's sides {i + 1} and {j + 1} cross"
+    # To its middle, or nothing is left of the numbers' precision.
+    x, y = (corners - corners.mean(axis=0)).T
+    area_m2 = 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
+    if area_m2 < _LEAST_AREA_M2:
+        return f"the polygon has an area of {area_m2:.0f} m2, and a view takes {_LEAST_AREA_M2:.0f}"
+    return None
+
+
+def _cross(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> bool:
+    """Whether the lines from a to b and from c to d do."""
+
+    def side(p: FloatArray, q: FloatArray, r: FloatArray) -> float:
+        (px, py), (qx, qy) = (q - p).tolist(), (r - p).tolist()
+        return float(px * qy - py * qx)
+
+    return side(a, b, c) * side(a, b, d) < 0.0 and side(c, d, a) * side(c, d, b) < 0.0
 
 
 def _write_snapshot(folder: Path, image: ImageArray, content: bytes) -> CommandReply:

@@ -186,6 +186,7 @@ class Daemon:
                 self._counts,
                 self.statistics,
                 lost_sigma_m=config.tracker.lost_sigma_m,
+                finder=self._finder,
                 log=self._log,
                 snapshots=_snapshot_folder(config),
             )
@@ -208,6 +209,7 @@ class Daemon:
                 replaced=lambda: self._slot.replaced,
                 camera=lambda: self._frames.counts() if isinstance(self._frames, Counting) else {},
                 unix_minus_stamp_ns=self._unix_minus_stamp_ns,
+                finder=self._finder,
                 bus=self._bus,
                 log=self._log,
                 page=page,

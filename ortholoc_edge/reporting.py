@@ -26,6 +26,7 @@ from ortholoc_edge.adapters.messages import (
     rejection_message,
 )
 from ortholoc_edge.commander import Commander
+from ortholoc_edge.pipeline.finder import Finder
 from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.ladder import Step, Strain
 from ortholoc_edge.pipeline.navigator import Navigator
@@ -73,6 +74,7 @@ class Reporter:
         replaced: Callable[[], int],
         camera: Callable[[], Mapping[str, int]],
         unix_minus_stamp_ns: Callable[[], int],
+        finder: Finder | None = None,
         bus: Bus | None = None,
         log: FlightLog | None = None,
         page: GroundPage | None = None,
@@ -92,6 +94,7 @@ class Reporter:
         self._link, self._vehicle, self._navigator, self._store = link, vehicle, navigator, store
         self._options, self._counts = options, counts
         self._bus, self._log, self._page, self._on_outcome = bus, log, page, on_outcome
+        self._finder = finder
         self._commander, self._replaced, self._camera = commander, replaced, camera
         self._unix_minus_stamp_ns = unix_minus_stamp_ns
         self._started_ns: int | None = None
@@ -279,6 +282,7 @@ class Reporter:
                 last_reason=None if last is None or isinstance(last, Fix) else last.reason.value,
                 rung=self._navigator.ladder.rung,
                 reset_counter=tracker.reset_counter,
+                search=None if self._finder is None else self._finder.says,
                 gnss=tracker.witness.report.state.value,
                 autopilot=self._link.connected(),
                 commands=self._bus.accepts_commands,

@@ -103,6 +103,7 @@ class StateMessage(Struct, frozen=True, kw_only=True):
         status: "track", "coast" or "search". paused: by command; then no frame is localized.
         last_fix_age_s: None before the first. last_reason: why the last frame was rejected; None if it was a fix.
         rung: 0 is all detail and all frames, see `LadderMessage`. reset_counter: as told to the autopilot.
+        search: what came of the last search of the map, for people; None where it is switched off.
         gnss: "ok", "suspect", "bad" or "unknown": whether it agrees with the fixes.
         autopilot: whether its heart beats. commands: whether any is accepted.
     """
@@ -115,6 +116,7 @@ class StateMessage(Struct, frozen=True, kw_only=True):
     last_reason: str | None
     rung: int
     reset_counter: int
+    search: str | None
     gnss: str
     autopilot: bool
     commands: bool
@@ -252,6 +254,20 @@ class SetPrior(_Command, frozen=True, kw_only=True):
     sigma_vertical_m: Annotated[float, Meta(ge=1, le=500)]
 
 
+_Corner = tuple[Annotated[float, Meta(ge=-90, le=90)], Annotated[float, Meta(ge=-180, le=180)]]
+
+
+class SearchFor(_Command, frozen=True, kw_only=True):
+    """``…/command/search``: look for the vehicle in the map at once, whatever the track says.
+
+    Attributes:
+        polygon: corners of the area that it is in, as (latitude, longitude), WGS 84, in order; it is looked for nowhere
+            else until it was found there. None: everywhere, and an area that was given before is forgotten.
+    """
+
+    polygon: Annotated[tuple[_Corner, ...], Meta(min_length=3, max_length=50)] | None = None
+
+
 class Pause(_Command, frozen=True, kw_only=True):
     """``…/command/pause``: localize no more frames, send nothing to the autopilot."""
 
@@ -264,7 +280,7 @@ class Snapshot(_Command, frozen=True, kw_only=True):
     """``…/command/snapshot``: write the last frame and what it came to into a file on the vehicle."""
 
 
-Command = Relocalize | SetPrior | Pause | Resume | Snapshot
+Command = Relocalize | SetPrior | SearchFor | Pause | Resume | Snapshot
 
 
 class CommandReply(Struct, frozen=True, kw_only=True):
@@ -296,6 +312,7 @@ ASKED: dict[str, type[Struct]] = {"config": ConfigMessage, "stats": StatsMessage
 COMMANDS: dict[str, type[Command]] = {
     "relocalize": Relocalize,
     "set_prior": SetPrior,
+    "search": SearchFor,
     "pause": Pause,
     "resume": Resume,
     "snapshot": Snapshot,

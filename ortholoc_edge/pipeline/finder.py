@@ -194,6 +194,7 @@ class Finder:
         self._began_ns: int | None = None
         self._hypothesis: _Hypothesis | None = None
         self._corners: FloatArray | None = None
+        self._demanded = False
         self._searches = 0
         self._former: list[tuple[Anchor, Sequence[Candidate]]] = []
         self._notices: list[str] = []
@@ -209,9 +210,9 @@ class Finder:
         self._tracker_options = options
 
     def search_in(self, corners_map: FloatArray | None, now_ns: int) -> None:
-        """Search at once, only inside this polygon (N, 2) of map coordinates until it is found there; None:
-        everywhere."""
-        self._corners, self._hypothesis, self._due_ns = corners_map, None, now_ns
+        """Search at once, whatever GNSS and the track say, only inside this polygon (N, 2) of map coordinates until it
+        is found there; None: everywhere."""
+        self._corners, self._hypothesis, self._due_ns, self._demanded = corners_map, None, now_ns, True
         self._former, self._last_fix_ns, self._began_ns = [], None, 0
         # What is under way looks elsewhere.
         self._asked = None
@@ -239,12 +240,12 @@ class Finder:
         if isinstance(outcome, Fix):
             self._last_fix_ns, self._lost_told = now_ns, False
         order = self._hear(now_ns)
-        if self._gnss_tells(state):
+        if self._gnss_tells(state) and not self._demanded:
             # It says where the vehicle is: there is nothing to be found.
             self._hypothesis, self._last_fix_ns, self.says = None, now_ns, ""
         elif self._seeker.idle and self._asked is None and now_ns >= self._due_ns:
             unfit = isinstance(outcome, Rejected) and outcome.reason in _UNFIT
-            wanted = self.is_lost(now_ns) or self._corners is not None or self._options.duty > 0.0
+            wanted = self.is_lost(now_ns) or self._demanded or self._options.duty > 0.0
             if wanted and not unfit:
                 self._ask(frame, state, now_ns)
         return order
@@ -329,7 +330,7 @@ class Finder:
         if asked is None:
             return None
         lost = self.is_lost(now_ns)
-        at_once = lost or self._corners is not None or self._options.duty <= 0.0
+        at_once = lost or self._demanded or self._options.duty <= 0.0
         pause_s = 0.0 if at_once else answer.took_s * (1.0 / self._options.duty - 1.0)
         self._due_ns = now_ns + round((_AFTER_FAILURE_S if answer.trouble else pause_s) * _S)
         if answer.trouble:
@@ -360,7 +361,8 @@ class Finder:
         )  # fmt: skip
         anchor = self._tracker.anchor
         if not lost and anchor is not None and self._same(anchor, place, state):
-            self._hypothesis, self.says = None, "the search finds the track's place"
+            self._hypothesis, self._corners, self._demanded = None, None, False
+            self.says = "the search finds the track's place"
             return None
         before = self._hypothesis
         count = before.count + 1 if before is not None and self._same(before.place, place, state) else 1
@@ -370,7 +372,7 @@ class Finder:
         if count < needed:
             self._hypothesis = _Hypothesis(place, count)
             return None
-        self._hypothesis, self._corners, self._former = None, None, []
+        self._hypothesis, self._corners, self._former, self._demanded = None, None, [], False
         what = "found again" if lost else "track dropped: the search finds it elsewhere"
         self._counts["found_again" if lost else "tracks_dropped"] += 1
         why = f"{what}, {_told(away_m)}, {count} times in a row"

@@ -16,6 +16,7 @@ from ortholoc_edge.adapters.camera import CameraOptions
 from ortholoc_edge.adapters.mavlink import LinkOptions
 from ortholoc_edge.config import Config, Intrinsics, MapOptions, MatcherOptions
 from ortholoc_edge.daemon import Daemon
+from ortholoc_edge.pipeline.finder import SearchOptions
 from ortholoc_edge.pipeline.navigator import TimingOptions
 
 from .fake_autopilot import FakeAutopilot, Wire, dialect
@@ -76,6 +77,8 @@ def config(source: str, endpoint: str, **more: Any) -> Config:
     camera = rendered.CAMERA
     # A busy test machine is not what is tested here.
     more.setdefault("timing", TimingOptions(max_age_ms=20_000.0))
+    # Nor is the search of the map, but in its own tests.
+    more.setdefault("search", SearchOptions(enabled=False))
     return Config(
         camera=CameraOptions(source=source, rate_hz=8.0),
         intrinsics=Intrinsics(

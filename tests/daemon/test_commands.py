@@ -25,6 +25,7 @@ from ortholoc_edge.bench.flight_log import read_frames
 from ortholoc_edge.cli import main
 from ortholoc_edge.config import Config, without_secrets
 from ortholoc_edge.daemon import Daemon
+from ortholoc_edge.pipeline.finder import SearchOptions
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.record import FrameRecord
 from ortholoc_edge.pipeline.tracker import GivenPosition, StartAnew
@@ -71,6 +72,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
             f"udpout:127.0.0.1:{autopilot.wire.port}",
             bus=BusOptions(enabled=True, vehicle="hawk", listen=(endpoint,), commands=True, image_rate_hz=10.0),
             log=LogOptions(folder=str(folder / "log"), frames="all"),
+            search=SearchOptions(agreements=10),
         ),
         on_outcome=lambda _, outcome: outcomes.append(outcome),
     )
@@ -101,6 +103,16 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
             command("set_prior", "outside", **prior(lat_deg=PLACE.lat_deg + 1.0))
             command("set_prior", "buried", **prior(height_amsl_m=-400.0))
             command("set_prior", "wide", **prior(sigma_horizontal_m=400.0))
+            # Where it is not, so that it is not found before it is called back.
+            triangle = [(-0.001, 0.0012), (0.001, 0.0012), (0.0, 0.002)]
+            corners = [[PLACE.lat_deg + y, PLACE.lon_deg + x] for x, y in triangle]
+            command("search", "in a triangle", polygon=corners)
+            wait_for(lambda: latest("stats")["statistics"].get("searches"), "a search")
+            square = [(0.0, 0.0), (0.001, 0.001), (0.001, 0.0), (0.0, 0.001)]
+            command("search", "crossed", polygon=[[PLACE.lat_deg + y, PLACE.lon_deg + x] for x, y in square])
+            command("search", "far away", polygon=[[lat + 2.0, lon] for lat, lon in corners])
+            command("search", "a line", polygon=[*corners[:2], corners[0]])
+            command("search")
             command("relocalize")
             ended_with(is_fix, 3, "fixes again")
             command("pause")
@@ -140,21 +152,25 @@ def records(flown: Flown) -> list[FrameRecord]:
 
 def test_commands_are_answered(flown: Flown) -> None:
     accepted = {name for name, reply in flown.replies.items() if reply.accepted}
-    assert accepted == {"astray", "relocalize", "pause", "resume", "snapshot"}
+    assert accepted == {"astray", "in a triangle", "search", "relocalize", "pause", "resume", "snapshot"}
     for name, words in {
         "outside": "m outside of the pack",
         "buried": "below the ground there",
         "wide": "400, up to 150 m is searched",
+        "crossed": "sides 1 and 3 cross",
+        "far away": "outside of the pack",
+        "a line": "has an area of 0 m2",
         "pause again": "paused already",
     }.items():
         assert words in flown.replies[name].reason
         assert flown.replies[name].remedy
     assert {text for text in flown.texts if "by command" in text} == {
-        f"OrthoLoC: {name} by command" for name in ("set_prior", "relocalize", "pause", "resume", "snapshot")
+        f"OrthoLoC: {name} by command" for name in ("set_prior", "search", "relocalize", "pause", "resume", "snapshot")
     }
     assert flown.states["paused"]["paused"] is True and flown.states["last"]["paused"] is False
     assert flown.states["last"]["status"] == "track"
-    assert flown.stats["commands"] == 9 and flown.stats["commands_refused"] == 4
+    assert flown.stats["commands"] == 14 and flown.stats["commands_refused"] == 7
+    assert flown.stats["searches"] >= 1
 
 
 def test_a_given_position_is_where_the_next_frame_is_searched(records: list[FrameRecord]) -> None:
@@ -201,7 +217,8 @@ def test_commands_are_in_the_log_for_people(flown: Flown) -> None:
         with path.open("rb") as file:
             found += [json.loads(m.data) for _, _, m in make_reader(file).iter_messages(topics=["/ortholoc/command"])]
     assert [(one["reply"]["command"], one["reply"]["accepted"]) for one in found] == [
-        ("set_prior", True), ("set_prior", False), ("set_prior", False), ("set_prior", False), ("relocalize", True),
+        ("set_prior", True), ("set_prior", False), ("set_prior", False), ("set_prior", False), ("search", True),
+        ("search", False), ("search", False), ("search", False), ("search", True), ("relocalize", True),
         ("pause", True), ("pause", False), ("resume", True), ("snapshot", True),
     ]  # fmt: skip
 
