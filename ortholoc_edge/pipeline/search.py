@@ -79,7 +79,8 @@ class Candidate:
         easting_m, northing_m: of the camera.
         above_ground_m: height that it was tried for.
         turn_rad: of the believed attitude about the vertical.
-        score: normalised correlation with the map, at most about 1.
+        score: normalised correlation with the map, at most about 1; of a height above ground that is lower than the
+            highest in question less in that ratio: the fewer pixels a frame has, the better it fits by chance.
     """
 
     easting_m: float
@@ -245,7 +246,8 @@ class _Near:
                 steps = round(math.log(self._sighting.height_m - ground_m) / math.log(_FINE_ZOOM))
                 above_m = _FINE_ZOOM**steps
         needed_px = side + 2 * _margin_px(replace(self._sighting, above_ground_m=above_m), field, 1)
-        scale = _Scale(field, 1, _TURN_RAD, 2 * cv2.getOptimalDFTSize(-(-needed_px // 2)))
+        highest_m = _highest_m(self._sighting, field)
+        scale = _Scale(field, 1, _TURN_RAD, 2 * cv2.getOptimalDFTSize(-(-needed_px // 2)), highest_m)
         turns = (place.turn_rad - _TURN_RAD, place.turn_rad, place.turn_rad + _TURN_RAD)
         tried = [self._template(scale, above_m, turn_rad) for turn_rad in turns]
         templates = [template for template in tried if template is not None]
@@ -261,20 +263,21 @@ class _Near:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scale:
-    """A pass over the map: its field, by how much coarser than what frames are rectified for, the step of the heading
-    and the side of the blocks."""
+    """A pass over the map: its field, by how much coarser than what frames are rectified for, the step of the heading,
+    the side of the blocks, and the highest that the camera can be above ground."""
 
     field: CoarseField
     halving: int
     turn_rad: float
     block_px: int
+    highest_m: float
 
 
 def _scale(sighting: Sighting, field: CoarseField, halving: int) -> _Scale:
     """With blocks of which a third or more is their inside."""
     margin_px = _margin_px(sighting, field, halving)
     block_px = max(_BLOCK_PX // halving, 2 * cv2.getOptimalDFTSize(-(-3 * margin_px // 2)))
-    return _Scale(field, halving, halving * _TURN_RAD, block_px)
+    return _Scale(field, halving, halving * _TURN_RAD, block_px, _highest_m(sighting, field))
 
 
 def circle(middle: FloatArray, radius_m: float) -> FloatArray:
@@ -396,16 +399,20 @@ def _steps(sighting: Sighting, field: CoarseField, block: _Block) -> Iterator[tu
 
 def _margin_px(sighting: Sighting, field: CoarseField, halving: int) -> int:
     """Pixels around a camera that its frame may show."""
-    camera, gsd_m = sighting.camera, field.grid.gsd_m
-    above_m = sighting.above_ground_m
-    if not math.isfinite(above_m):
-        lowest = float(np.nanmin(field.ground)) if np.isfinite(field.ground).any() else 0.0
-        above_m = max(sighting.height_m - lowest, 1.0)
+    camera, gsd_m, above_m = sighting.camera, field.grid.gsd_m, _highest_m(sighting, field)
     corners = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]], np.float64)
     rays = camera.unproject(corners) @ sighting.map_from_camera.T
     slope = np.hypot(rays[:, 0], rays[:, 1]) / np.maximum(-rays[:, 2], 0.25)
     reach = (1.0 + sighting.height_reach) * above_m * float(np.nan_to_num(slope, nan=4.0).max()) / gsd_m
     return min(math.ceil(reach) + 3, _MAX_CANVAS_PX // halving)
+
+
+def _highest_m(sighting: Sighting, field: CoarseField) -> float:
+    """That the camera can be above ground."""
+    if math.isfinite(sighting.above_ground_m):
+        return sighting.above_ground_m
+    lowest = float(np.nanmin(field.ground)) if np.isfinite(field.ground).any() else 0.0
+    return max(sighting.height_m - lowest, 1.0)
 
 
 def _search_block(
@@ -434,6 +441,8 @@ def _search_block(
         # The frame's shape is a turned one of many: a square of its size is near enough.
         side = round(math.sqrt(float(np.mean([template.pixels for template in templates]))))
         energy = cv2.boxFilter(squares, -1, (side, side), borderType=cv2.BORDER_CONSTANT)[inner, inner]
+        # By chance a frame of a quarter of the pixels fits twice as well.
+        score *= min(templates[0].above_ground_m / scale.highest_m, 1.0)
         score /= np.sqrt(np.maximum(energy, least))
         if band is not None:
             low, high = band
