@@ -189,7 +189,8 @@ class Finder:
         self._tracker_options, self._georeference = tracker_options, georeference
         self._camera, self._counts = camera, counts
         self._asked: _Asked | None = None
-        self._due_ns = 0
+        # Of the next check of a track; and of any search after one that could not be made.
+        self._due_ns = self._retry_ns = 0
         self._last_fix_ns: int | None = None
         self._began_ns: int | None = None
         self._hypothesis: _Hypothesis | None = None
@@ -212,7 +213,7 @@ class Finder:
     def search_in(self, corners_map: FloatArray | None, now_ns: int) -> None:
         """Search at once, whatever GNSS and the track say, only inside this polygon (N, 2) of map coordinates until it
         is found there; None: everywhere."""
-        self._corners, self._hypothesis, self._due_ns, self._demanded = corners_map, None, now_ns, True
+        self._corners, self._hypothesis, self._retry_ns, self._demanded = corners_map, None, now_ns, True
         self._former, self._last_fix_ns, self._began_ns = [], None, 0
         # What is under way looks elsewhere.
         self._asked = None
@@ -243,10 +244,10 @@ class Finder:
         if self._gnss_tells(state) and not self._demanded:
             # It says where the vehicle is: there is nothing to be found.
             self._hypothesis, self._last_fix_ns, self.says = None, now_ns, ""
-        elif self._seeker.idle and self._asked is None and now_ns >= self._due_ns:
+        elif self._seeker.idle and self._asked is None and now_ns >= self._retry_ns:
             unfit = isinstance(outcome, Rejected) and outcome.reason in _UNFIT
-            wanted = self.is_lost(now_ns) or self._demanded or self._options.duty > 0.0
-            if wanted and not unfit:
+            check = self._options.duty > 0.0 and now_ns >= self._due_ns
+            if (check or self._demanded or self.is_lost(now_ns)) and not unfit:
                 self._ask(frame, state, now_ns)
         return order
 
@@ -330,10 +331,10 @@ class Finder:
         if asked is None:
             return None
         lost = self.is_lost(now_ns)
-        at_once = lost or self._demanded or self._options.duty <= 0.0
-        pause_s = 0.0 if at_once else answer.took_s * (1.0 / self._options.duty - 1.0)
-        self._due_ns = now_ns + round((_AFTER_FAILURE_S if answer.trouble else pause_s) * _S)
+        if self._options.duty > 0.0:
+            self._due_ns = now_ns + round(answer.took_s * (1.0 / self._options.duty - 1.0) * _S)
         if answer.trouble:
+            self._retry_ns = now_ns + round(_AFTER_FAILURE_S * _S)
             self._counts["searches_failed"] += 1
             self.says = answer.trouble
             if not self._trouble_told:

@@ -24,6 +24,8 @@ from ortholoc_edge.tiles.georeference import Georeference
 LOST_DRIFT_M_PER_S = 5.0
 # With each fix that the odometry agrees with it is believed to err by half of that.
 _DRIFT_FORGOTTEN = 0.5
+# A fix farther than that from where the odometry has led says that it is worse than it should be.
+_SURPRISE_SIGMAS = 4.0
 # Between GNSS and the chain of fixes, over position.
 _CONTRADICTION_SIGMAS = 4.0
 
@@ -168,6 +170,8 @@ class Tracker:
         self.anchor: Anchor | None = None
         self._given: GivenPosition | None = None
         self._last_prior: PosePrior | None = None
+        # Whether the prediction was not from the anchor.
+        self._predicted_elsewhere = False
         self._gnss_turn = False
         self.status = TrackerStatus.SEARCH
         self.reset_counter = first_reset_counter % 256
@@ -195,7 +199,7 @@ class Tracker:
 
     def predict(self, state: VehicleState) -> PosePrior | Rejected:
         """The pose to expect at the state's stamp, or why there is none."""
-        self._last_prior = None
+        self._last_prior, self._predicted_elsewhere = None, False
         attitude = state.ned_from_body
         if attitude is None or not np.isfinite(attitude).all() or not np.isfinite(state.attitude_sigma_rad).all():
             why = f": {state.no_attitude_because}" if state.no_attitude_because else ""
@@ -218,6 +222,7 @@ class Tracker:
             if believed is not None:
                 # The chain of fixes is broken: the next one is a new start, and the autopilot must hear of it as one.
                 carried, self.status = believed, TrackerStatus.SEARCH
+                self._predicted_elsewhere = True
         if carried is None:
             return Rejected(state.stamp_ns, Reason.NO_PRIOR, "no fix yet and no position from the autopilot")
         position, position_covariance = carried
@@ -261,7 +266,7 @@ class Tracker:
         ground = outcome.ground_covariance
         covariance = cov.of_moved_point(outcome.covariance, lever)
         settled = covariance if ground is None else cov.of_moved_point(outcome.covariance - ground, lever)
-        drift_m_per_s = self._drift_seen(state, body.translation)
+        drift_m_per_s = self._drift_seen(state, body.translation, covariance[:3, :3])
         anchor = anchor_at(state, body.translation, covariance[:3, :3], settled[:3, :3], firm=True)
         self.anchor = replace(anchor, drift_m_per_s=drift_m_per_s)
         if state.position_map_m is not None:
@@ -269,14 +274,18 @@ class Tracker:
             self.witness.compare(state.stamp_ns, state.position_map_m - body.translation, both)
         self.status = TrackerStatus.TRACK
 
-    def _drift_seen(self, state: VehicleState, position: FloatArray) -> float:
+    def _drift_seen(self, state: VehicleState, position: FloatArray, covariance: FloatArray) -> float:
         """What the odometry may err after a fix, see `Anchor`, by what it did before it."""
         anchor, least = self.anchor, self._options.odometry_drift_m_per_s
-        if anchor is None or anchor.drift_m_per_s <= least:
+        # Of a place that somebody gave, or GNSS, the fix says more than of the odometry since.
+        if anchor is None or not anchor.firm or self._predicted_elsewhere:
             return 0.0
-        carried_to = carried(anchor, state, self._options, self._georeference)[0]
-        elapsed_s = max(abs(state.stamp_ns - anchor.stamp_ns) * 1e-9, 1e-3)
-        seen = float(np.linalg.norm((position - carried_to)[:2])) / elapsed_s
+        there, spread = carried(anchor, state, self._options, self._georeference)
+        step = (position - there)[:2]
+        surprising = cov.mahalanobis_squared(step, (spread + covariance)[:2, :2]) > _SURPRISE_SIGMAS**2
+        if not surprising and anchor.drift_m_per_s <= least:
+            return 0.0
+        seen = float(np.linalg.norm(step)) / max(abs(state.stamp_ns - anchor.stamp_ns) * 1e-9, 1e-3)
         drift = max(_DRIFT_FORGOTTEN * anchor.drift_m_per_s, min(seen, 2.0 * LOST_DRIFT_M_PER_S))
         return drift if drift > least else 0.0
 
