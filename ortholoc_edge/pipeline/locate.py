@@ -36,6 +36,7 @@ _HEIGHT_SIGMA: Final = 0.04
 # Of an attitude that nothing else is said of.
 _TILT_SIGMA_RAD: Final = math.radians(1.0)
 _KEPT_LEVELS: Final = 2
+_LOW_PERCENT: Final = 10.0
 # Of a frame, that later ones of the flight can make something of.
 _KEPT: Final = 60
 # What candidates of two frames may be apart for the same place: pixels of the field, and a part of how far the vehicle
@@ -106,9 +107,10 @@ class Searchers:
         """
         store, above_m = self._store, above_ground_m
         if not math.isfinite(above_m):
-            tiles = store.pack.manifest.dsm.tiles
-            # The highest ground makes the smallest footprint; a mean one will do.
-            above_m = max(height_m - float(np.median([(tile.min_m + tile.max_m) / 2 for tile in tiles])), 1.0)
+            # Over low ground, where a frame shows most: a level finer takes four times the time and memory, and over
+            # high ground less of the frame's detail will do.
+            low_m = float(np.percentile([tile.min_m for tile in store.pack.manifest.dsm.tiles], _LOW_PERCENT))
+            above_m = max(height_m - low_m, 1.0)
         level = fitting_level(store.dop_grids, camera, above_m)
         if level in self._made:
             return self._made[level]

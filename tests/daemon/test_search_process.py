@@ -8,13 +8,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
-import pytest
 from replay import rendered
 
 from ortholoc_edge.geometry import rotation
@@ -22,7 +21,7 @@ from ortholoc_edge.pipeline.finder import Answer, Ask
 from ortholoc_edge.pipeline.localizer import LocalizerOptions
 from ortholoc_edge.pipeline.outcome import Fix, Rejected
 from ortholoc_edge.pipeline.search import Sighting
-from ortholoc_edge.search_process import SearchProcess, SearchSetup
+from ortholoc_edge.search_process import MapSeeker, SearchProcess, SearchSetup
 
 TRUTH = rendered.pose(roll_deg=2.0, pitch_deg=-3.0)
 
@@ -64,67 +63,54 @@ def is_running(pid: int) -> bool:
         return False
 
 
-@pytest.fixture
-def process() -> Iterator[SearchProcess]:
-    made = SearchProcess(setup())
-    yield made
-    made.close()
-
-
-def test_found_by_another_process_below_everything_else(process: SearchProcess) -> None:
-    assert process.pid is None, "started when it is needed"
-    assert process.idle
-    process.ask(ask())
-    assert not process.idle
-    answer = answer_of(process)
-    assert (answer.trouble, process.idle, process.take()) == ("", True, None)
-    assert isinstance(answer.outcome, Fix)
-    assert np.linalg.norm(answer.outcome.map_from_camera.translation - TRUTH.translation) < 1.0
-    assert answer.own[0].score >= answer.own[-1].score
-    assert answer.took_s > 0.0
-    pid = process.pid
-    assert pid is not None
-    assert os.getpriority(os.PRIO_PROCESS, pid) == 19
-    own = int(Path("/proc/self/oom_score_adj").read_text())
-    assert int(Path(f"/proc/{pid}/oom_score_adj").read_text()) == min(own + 500, 1000)
-    # The same process the second time.
-    process.ask(ask(8))
-    assert answer_of(process).outcome.stamp_ns == 8
-    assert process.pid == pid
-
-
-def test_killed_it_says_so_and_is_there_again(process: SearchProcess) -> None:
-    process.ask(ask())
-    pid = wait_for(lambda: process.pid)
-    assert isinstance(pid, int)
-    os.kill(pid, signal.SIGKILL)
-    answer = answer_of(process)
-    assert isinstance(answer.outcome, Rejected)
-    assert "the search's process ended (exit code -9" in answer.trouble
-    assert process.idle
-    process.ask(ask())
-    assert isinstance(answer_of(process).outcome, Fix)
-    # Killed while it had nothing to do.
-    pid = process.pid
-    assert pid is not None
-    os.kill(pid, signal.SIGKILL)
-    wait_for(lambda: True if process.pid is None else None)
-    process.ask(ask())
-    assert isinstance(answer_of(process).outcome, Fix)
-
-
-def test_a_map_that_can_not_be_searched_is_trouble_and_not_the_end(tmp_path: Path) -> None:
-    for changes, why in (
-        ({"pack": tmp_path / "no-pack"}, "no-pack"),
-        ({"max_mb": 0}, "and 0 are allowed; search a part, fly higher, or allow more"),
-    ):
-        process = SearchProcess(setup(**changes))
-        for _ in range(2):
-            process.ask(ask())
-            answer = answer_of(process)
-            assert isinstance(answer.outcome, Rejected)
-            assert why in answer.trouble
+def test_found_by_another_process_below_everything_else_which_may_be_killed() -> None:
+    process = SearchProcess(setup())
+    try:
+        assert process.pid is None, "started when it is needed"
+        assert process.idle
+        process.ask(ask())
+        assert not process.idle
+        answer = answer_of(process)
+        assert (answer.trouble, process.idle, process.take()) == ("", True, None)
+        assert isinstance(answer.outcome, Fix)
+        assert np.linalg.norm(answer.outcome.map_from_camera.translation - TRUTH.translation) < 1.0
+        assert answer.own[0].score >= answer.own[-1].score
+        assert answer.took_s > 0.0
+        pid = process.pid
+        assert pid is not None
+        assert os.getpriority(os.PRIO_PROCESS, pid) == 19
+        own = int(Path("/proc/self/oom_score_adj").read_text())
+        assert int(Path(f"/proc/{pid}/oom_score_adj").read_text()) == min(own + 500, 1000)
+        # The same process the second time; killed in the middle of it.
+        process.ask(ask(8))
+        assert process.pid == pid
+        os.kill(pid, signal.SIGKILL)
+        answer = answer_of(process)
+        assert isinstance(answer.outcome, Rejected)
+        assert "the search's process ended (exit code -9" in answer.trouble
+        assert process.idle
+        process.ask(ask(9))
+        answer = answer_of(process)
+        assert isinstance(answer.outcome, Fix)
+        assert answer.outcome.stamp_ns == 9
+    finally:
         process.close()
+
+
+def test_a_map_that_can_not_be_read_is_trouble_and_not_the_end(tmp_path: Path) -> None:
+    process = SearchProcess(setup(pack=tmp_path / "no-pack"))
+    for _ in range(2):
+        process.ask(ask())
+        answer = answer_of(process)
+        assert isinstance(answer.outcome, Rejected)
+        assert "no-pack" in answer.trouble
+    process.close()
+
+
+def test_a_map_that_takes_too_much_memory_is_not_searched() -> None:
+    seeker = MapSeeker(setup(max_mb=0))
+    assert "and 0 are allowed; search a part, fly higher, or allow more" in seeker.answer(ask()).trouble
+    seeker.close()
 
 
 def test_closed_in_the_middle_it_ends_at_once() -> None:
@@ -141,9 +127,13 @@ def test_closed_in_the_middle_it_ends_at_once() -> None:
 def test_it_ends_with_its_owner() -> None:
     """Also where that is killed, so that it can't say so."""
     code = (
-        "import sys, time; sys.path[:0] = ['tests']; from daemon.test_search_process import *\n"
-        "process = SearchProcess(setup()); process.ask(ask()); answer_of(process)\n"
-        "print(process.pid, flush=True); time.sleep(60)"
+        "import time; from pathlib import Path\n"
+        "from ortholoc_edge.geometry.camera import Camera\n"
+        "from ortholoc_edge.pipeline.localizer import LocalizerOptions\n"
+        "from ortholoc_edge.search_process import SearchProcess, SearchSetup\n"
+        "camera = Camera.from_focal(64, 48, 50.0)\n"
+        "process = SearchProcess(SearchSetup(Path('none'), None, camera, LocalizerOptions(), 1, 1, 1))\n"
+        "process._started(); print(process.pid, flush=True); time.sleep(60)"
     )
     root = Path(__file__).parents[2]
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, cwd=root, text=True) as owner:
