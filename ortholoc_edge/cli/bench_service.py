@@ -62,10 +62,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     faults.set_defaults(run=_faults)
     jitter = kinds.add_parser(
         "jitter",
-        help="what flight log, bus and ground page cost the frame path",
+        help="what flight log, bus and ground page cost the frame path, or the search of the map",
         description="Rounds with flight log (all frames), bus and page with a listener each, and telemetry, against "
         "rounds with none of them: the time from a frame's stamp until its fix is at the simulated autopilot.",
     )
+    jitter.add_argument("--search", action="store_true", help="with a search that does not end, against none")
     jitter.add_argument("--rounds", type=positive_int, default=10, metavar="N", help="(default: %(default)s)")
     jitter.add_argument(
         "--frames", type=positive_int, default=150, metavar="N", help="of each, at 10 Hz (default: %(default)s)"
@@ -127,7 +128,7 @@ def _jitter(args: argparse.Namespace) -> int:
     writable_folder(args.out, "--out")
     load = os.getloadavg()[0]
     with tqdm(total=args.rounds, desc="rounds", leave=False) as bar:
-        found = measure(args.out, args.rounds, args.frames, lambda done: bar.update(done - bar.n))
+        found = measure(args.out, args.rounds, args.frames, lambda done: bar.update(done - bar.n), search=args.search)
     if args.json:
         print(msgspec.json.encode(found).decode())
         return 0

@@ -1,4 +1,5 @@
-"""What telemetry, flight log and ground page cost the frame path: the daemon with all of them and with none, in turns.
+"""What telemetry, flight log and ground page cost the frame path, or the search of the map beside it: the daemon with
+all of them and with none, in turns.
 
 The aircraft hovers, so that the same pictures, drawn once, fit every life of the daemon. A frame's time is from its
 stamp until its fix is in the simulated autopilot's socket.
@@ -24,6 +25,7 @@ from ortholoc_edge.cli.install_service import service_file
 from ortholoc_edge.clock import SystemClock
 from ortholoc_edge.errors import OrtholocError
 from ortholoc_edge.tiles.pack import Pack
+from ortholoc_edge.tiles.store import MapStore
 from ortholoc_sim import demo_pack_path
 from ortholoc_sim.autopilot import FilterOptions, UdpPort
 from ortholoc_sim.browser import watch
@@ -40,6 +42,7 @@ RATE_HZ = 10.0
 # Of each life: connecting, loading, the first searches.
 _SETTLING = 20
 _LEG_M = 1.0
+_CORNER_M = 150.0
 _REST_S = 30
 _JPEG = [cv2.IMWRITE_JPEG_QUALITY, 92]
 Tables = Mapping[str, Mapping[str, Any]]
@@ -62,13 +65,14 @@ class Jitter:
 
 
 def measure(
-    folder: Path, rounds: int, frames: int, on_round: Callable[[int], None] = lambda _: None
+    folder: Path, rounds: int, frames: int, on_round: Callable[[int], None] = lambda _: None, *, search: bool = False
 ) -> Jitter:
     """Fly so many rounds, each with and without, in alternating order.
 
     Args:
         folder: for pictures, configuration and logs.
         frames: of each life of the daemon, at `RATE_HZ`.
+        search: with and without a search that does not end, where the vehicle is not, and nothing else.
     Raises: OrtholocError if the daemon does not come to fixes.
     """
     options = FlightOptions(route_m=((250.0, 230.0), (250.0 + _LEG_M, 230.0)))
@@ -107,7 +111,7 @@ def measure(
         for number in range(rounds):
             for loaded in (False, True) if number % 2 == 0 else (True, False):
                 tables = _tables(options, pictures, f"udpout:127.0.0.1:{port.port}")
-                lives[loaded].append(_life(folder, tables, loaded, loop))
+                lives[loaded].append(_life(folder, tables, loaded, loop, search))
                 if failures:
                     raise OrtholocError(f"jitter: {failures[0]!r}") from failures[0]
             on_round(number + 1)
@@ -132,11 +136,15 @@ def _tables(options: FlightOptions, pictures: Path, link: str) -> dict[str, dict
     }  # fmt: skip
 
 
-def _life(folder: Path, tables: dict[str, dict[str, Any]], loaded: bool, loop: ClosedLoop) -> list[float]:
+def _life(
+    folder: Path, tables: dict[str, dict[str, Any]], loaded: bool, loop: ClosedLoop, search: bool
+) -> list[float]:
     """One life of the daemon: times of its frames, ms."""
     with ExitStack() as resources:
-        if loaded:
-            bus, page = free_ports(2)
+        bus, page = free_ports(2)
+        if search:
+            tables["bus"] = {"enabled": True, "listen": [f"tcp/127.0.0.1:{bus}"], "commands": True}
+        elif loaded:
             tables["link"] |= {"computer_status_rate_hz": 1.0, "quality_rate_hz": 1.0}
             tables["log"] = {"folder": str(folder / "log"), "frames": "all", "max_mb": 64}
             tables["bus"] = {"enabled": True, "listen": [f"tcp/127.0.0.1:{bus}"], "image_rate_hz": 5.0}
@@ -153,7 +161,9 @@ def _life(folder: Path, tables: dict[str, dict[str, Any]], loaded: bool, loop: C
         before = len(loop.autopilot.vision)
         supervisor = resources.enter_context(Supervisor(daemon_command(path), rules, folder, {}))
         _wait(lambda: supervisor.is_ready, supervisor)
-        if loaded:
+        if loaded and search:
+            _search(f"tcp/127.0.0.1:{bus}")
+        elif loaded:
             _listeners(resources, bus, page)
         _wait(lambda: supervisor.count("ended") > 0, supervisor)
         if supervisor.count("started") > 1:
@@ -161,6 +171,22 @@ def _life(folder: Path, tables: dict[str, dict[str, Any]], loaded: bool, loop: C
         records = loop.autopilot.vision[before:]
     taken = sorted({record.capture_ns: record.arrival_ns for record in records}.items())
     return [(arrival_ns - capture_ns) / 1e6 for capture_ns, arrival_ns in taken[_SETTLING:]]
+
+
+def _search(endpoint: str) -> None:
+    """Have the daemon search in the pack's south-west corner, where the vehicle is not, without an end."""
+    pack = Pack.open(demo_pack_path())
+    with MapStore(pack) as store:
+        west, south, _, _ = store.bounds
+    corners = []
+    for east, north in ((0.0, 0.0), (_CORNER_M, 0.0), (0.0, _CORNER_M)):
+        place = pack.georeference.geodetic_from_map(np.array([west + east, south + north, 0.0]))
+        corners.append([place.lat_deg, place.lon_deg])
+    with closing(zenoh_session("client", connect=endpoint)) as session:
+        replies = session.get("ortholoc/vehicle/command/search", payload=json.dumps({"polygon": corners}))
+        accepted = [json.loads(reply.ok.payload.to_bytes())["accepted"] for reply in replies if reply.ok is not None]
+    if accepted != [True]:
+        raise OrtholocError(f"jitter: the daemon does not search: {accepted}")
 
 
 def _listeners(resources: ExitStack, bus: int, page: int) -> None:
