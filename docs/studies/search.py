@@ -163,7 +163,7 @@ class Found(Struct, kw_only=True):
     Attributes:
         rank: of the right place among the candidates, 0 the first; 999 where it is not among them.
         scores: of the first candidates.
-        lead, probability: as of `Located`, of a fix.
+        lead, chance: as of `Located`.
         support, reason: of the fix that is believed, or why there is none.
         passed: (score, support, error m) of each place that the localizer itself lets pass, `LocateOptions` aside.
         error_m: of the fix.
@@ -176,6 +176,7 @@ class Found(Struct, kw_only=True):
     rank: int
     scores: list[float]
     lead: float
+    chance: float = math.nan
     support: float | None
     reason: str | None
     passed: list[tuple[float, float, float]]
@@ -238,6 +239,7 @@ def find(args: argparse.Namespace) -> None:
                 rank=next((rank for rank, m in enumerate(away) if m < NEAR_M), 999),
                 scores=[one.score for one in located.candidates[:20]],
                 lead=located.lead if math.isfinite(located.lead) else 999.0,
+                chance=located.chance,
                 support=None if fix is None else fix.quality,
                 reason=None if fix is not None else str(located.outcome.reason),
                 passed=passed,

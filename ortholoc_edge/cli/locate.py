@@ -200,6 +200,7 @@ def _lines(photo: _Photo, located: Located, store: MapStore, took_s: float) -> l
         lines.append(f"fits {located.lead:.2f} times as well as the next place")
     if photo.truth is not None and isinstance(located.outcome, Fix):
         lines.append(f"{_error_m(located.outcome, photo.truth):.2f} m from where the sequence has it")
+    lines.append(f"the best place is right with a probability of {located.chance:.2f}, before it was looked at closely")
     lines.append(f"{took_s:.1f} s, {len(located.tried)} of {len(located.candidates)} candidates looked at closely")
     return lines
 
@@ -211,6 +212,7 @@ def _record(photo: _Photo, located: Located, store: MapStore, took_s: float) -> 
     places = located.candidates[:_TOLD]
     record |= {
         "lead": located.lead if math.isfinite(located.lead) else None,
+        "chance": located.chance,
         "candidates": [[one.easting_m, one.northing_m, one.score] for one in places],
         "seconds": took_s,
     }

@@ -43,6 +43,10 @@ _KEPT: Final = 60
 # has come.
 _AGREE_PX: Final = 5.0
 _AGREE_RATIO: Final = 0.05
+# Logistic regression, for whether the best place is right: of the logarithm of its score over the next place's, of its
+# score, and a constant (docs/studies/search.md).
+_CHANCE: Final = (28.3, 18.4, -6.2)
+_MOST_LOG_LEAD: Final = 1.0
 # Fixes closer than this part of the height above ground are of one place.
 _SAME_PLACE: Final = 0.1
 
@@ -76,6 +80,7 @@ class Located:
         own: of the frame alone: what a later one wants to know of it.
         tried: what the localizer said of the first of them, as many as it was asked about.
         lead: score of the place that is meant, over that of the best other one; 0 where there is none.
+        chance: that the best candidate is right, before the localizer was asked, see `chance`.
     """
 
     outcome: Outcome
@@ -83,6 +88,24 @@ class Located:
     tried: list[Outcome]
     lead: float
     own: list[Candidate]
+
+    @property
+    def chance(self) -> float:
+        return chance(self.candidates)
+
+
+def chance(candidates: Sequence[Candidate]) -> float:
+    """Probability that the best of the candidates of one frame is right, if the place is in the map at all.
+
+    Fitted to a barometer's heights; where the height above ground is known, scores are higher and it is too sure.
+    """
+    if not candidates:
+        return 0.0
+    first = candidates[0].score
+    next_ = candidates[1].score if len(candidates) > 1 else 0.0
+    log_lead = min(math.log(first / next_), _MOST_LOG_LEAD) if next_ > 0.0 else _MOST_LOG_LEAD
+    by_lead, by_score, constant = _CHANCE
+    return 1.0 / (1.0 + math.exp(-(by_lead * log_lead + by_score * first + constant)))
 
 
 class Searchers:

@@ -17,7 +17,7 @@ from ortholoc_edge.geometry.arrays import ImageArray
 from ortholoc_edge.matching.types import Structural
 from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.localizer import Localizer, LocalizerOptions
-from ortholoc_edge.pipeline.locate import LocateOptions, judged, locate
+from ortholoc_edge.pipeline.locate import LocateOptions, chance, judged, locate
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.search import Candidate, Searcher, Sighting, fitting_level
 from ortholoc_edge.tiles.coarse import CoarseField
@@ -119,6 +119,17 @@ def test_one_place_that_convinces_both() -> None:
     assert lead == pytest.approx(0.5 / 0.45)
     # The same place, found from its neighbour too.
     assert outcome_of([right, fix((4.0, 0.0, 100.0))])[0] is right
+
+
+def test_the_chance_grows_with_lead_and_score() -> None:
+    def of(*scores: float) -> float:
+        return chance([Candidate(1000.0 * k, 0.0, 100.0, 0.0, score) for k, score in enumerate(scores)])
+
+    assert of(0.3, 0.2) > of(0.3, 0.29) > of(0.15, 0.145)
+    assert 0.99 < of(0.5, 0.2) < 1.0
+    assert of(0.12, 0.118) < 0.1
+    assert of(0.4) > 0.99
+    assert of() == 0.0
 
 
 def test_two_places_that_fit() -> None:
