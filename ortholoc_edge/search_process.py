@@ -169,8 +169,7 @@ class SearchProcess:
                     raise TimeoutError(f"no answer within {_PATIENCE_S:.0f} s")
             answer = line.recv()
             assert isinstance(answer, Answer), "it sends nothing else"
-        except (OSError, EOFError, TimeoutError) as error:
-            # Killed for memory, say: the next search starts it anew.
+        except Exception as error:  # whatever it is, the thread goes on: killed for memory, say
             code = self._end_child()
             why = f"the search's process ended (exit code {code}: {error or type(error).__name__})"
             logger.warning("%s; it is started again for the next search", why)

@@ -240,11 +240,13 @@ class Finder:
             self._began_ns = now_ns
         if isinstance(outcome, Fix):
             self._last_fix_ns, self._lost_told = now_ns, False
-        order = self._hear(now_ns)
         if self._gnss_tells(state) and not self._demanded:
-            # It says where the vehicle is: there is nothing to be found.
-            self._hypothesis, self._last_fix_ns, self.says = None, now_ns, ""
-        elif self._seeker.idle and self._asked is None and now_ns >= self._retry_ns:
+            # It says where the vehicle is: there is nothing to be found, and what was found meanwhile is not needed.
+            self._hypothesis, self._last_fix_ns, self.says, self._asked = None, now_ns, "", None
+            self._seeker.take()
+            return None
+        order = self._hear(now_ns)
+        if self._seeker.idle and self._asked is None and now_ns >= self._retry_ns:
             unfit = isinstance(outcome, Rejected) and outcome.reason in _UNFIT
             check = self._options.duty > 0.0 and now_ns >= self._due_ns
             if (check or self._demanded or self.is_lost(now_ns)) and not unfit:

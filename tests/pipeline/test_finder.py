@@ -118,6 +118,15 @@ def test_a_vehicle_with_gnss_is_not_searched_for() -> None:
     assert flight.seeker.asked == []
 
 
+def test_what_was_found_while_gnss_came_back_is_not_heard() -> None:
+    flight = Flight(SearchOptions(agreements=1))
+    flight.until_asked()
+    flight.seeker.say(flight.found((900.0, 0.0)))
+    assert flight.frame(gnss=flight.place(flight.second + 1)) is None
+    assert flight.frame() is None
+    assert flight.counts["searches_found"] == 0
+
+
 def test_lost_it_is_searched_for_and_believed_the_second_time() -> None:
     flight = Flight()
     flight.tracked()
