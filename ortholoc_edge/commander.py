@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import datetime
 import logging
-import math
 import os
 from collections import Counter
 from collections.abc import Callable
@@ -17,7 +16,7 @@ import numpy as np
 
 from ortholoc_edge.adapters.commands import Answer
 from ortholoc_edge.adapters.flight_log import FlightLog, LoggedStep
-from ortholoc_edge.adapters.mavlink import AutopilotLink, PositionRequest, Severity
+from ortholoc_edge.adapters.mavlink import AutopilotLink, Severity
 from ortholoc_edge.adapters.messages import (
     Command,
     CommandReply,
@@ -46,11 +45,6 @@ _S = 1_000_000_000
 # Of a megabyte or less each: who needs more wants a flight log with all frames.
 _MOST_SNAPSHOTS = 100
 _LEAST_AREA_M2 = 1000.0
-# Of a position over MAVLink that is too uncertain for a prior: half the side of the square that is searched; and of the
-# autopilot's height.
-_AREA_SIGMAS = 3.0
-_MAVLINK_SIGMA_VERTICAL_M = 10.0
-_DEGREE_M = 111_000.0
 # For a typical height of the ground.
 _GROUND_GSD_M = 4.0
 
@@ -119,34 +113,6 @@ class Commander:
         if self._log is not None:
             self._log.command(now_ns, command, said)
         return answer
-
-    def take_position(self, request: PositionRequest, height_amsl_m: float | None) -> bool:
-        """A position that came over MAVLink: a command like those of the bus.
-
-        Args:
-            height_amsl_m: of the vehicle; the request has none.
-        Returns: whether it was accepted.
-        """
-        reach_m = _AREA_SIGMAS * request.sigma_m
-        command: Command
-        if request.sigma_m > self.lost_sigma_m:
-            command = SearchFor(polygon=_box(request.lat_deg, request.lon_deg, reach_m))
-        elif height_amsl_m is None:
-            logger.warning("a position over MAVLink is refused: the autopilot does not tell its height")
-            return False
-        else:
-            command = SetPrior(
-                lat_deg=request.lat_deg,
-                lon_deg=request.lon_deg,
-                height_amsl_m=height_amsl_m,
-                sigma_horizontal_m=request.sigma_m,
-                sigma_vertical_m=_MAVLINK_SIGMA_VERTICAL_M,
-            )
-        answer = self.carry_out(command)
-        assert isinstance(answer, CommandReply), "only a snapshot leaves something to be done"
-        if not answer.accepted:
-            logger.warning("a position over MAVLink is refused: %s; %s", answer.reason, answer.remedy)
-        return answer.accepted
 
     def _relocalize(self, command: Relocalize, now_ns: int) -> CommandReply:
         if not (self._navigator.tracker.witness.trusted or command.trust_gnss):
@@ -236,15 +202,6 @@ class Commander:
         )
         folder = self._snapshots
         return lambda: _write_snapshot(folder, frame.image, content)
-
-
-def _box(lat_deg: float, lon_deg: float, reach_m: float) -> tuple[tuple[float, float], ...]:
-    """Corners (latitude, longitude) of a square around a place, in order."""
-    north = reach_m / _DEGREE_M
-    east = north / max(math.cos(math.radians(lat_deg)), 0.01)
-    low, high = max(lat_deg - north, -90.0), min(lat_deg + north, 90.0)
-    west, right = max(lon_deg - east, -180.0), min(lon_deg + east, 180.0)
-    return (low, west), (low, right), (high, right), (high, west)
 
 
 def unusable_area(corners: FloatArray, bounds: Bounds) -> str | None:

@@ -410,7 +410,6 @@ class Daemon:
             ended = self._ended.is_set()
             item = self._slot.take(_WAIT_S)
             self._desk.serve()
-            self._hear_positions()
             self.report()
             if item is None:
                 if ended:
@@ -433,11 +432,6 @@ class Daemon:
                 self._reporter.publish(frame, Rejected(item.stamp_ns, Reason.INTERNAL, repr(error)))
                 if errors >= _MAX_ERRORS_IN_A_ROW:
                     raise OrtholocError(f"{errors} frames in a row failed, last with {error!r}") from error
-
-    def _hear_positions(self) -> None:
-        while (request := self._link.take_request()) is not None:
-            height_m = self._vehicle.height_amsl_m(self._clock.now_ns())
-            self._link.answer_request(request, self._commander.take_position(request, height_m))
 
     def report(self) -> None:
         """Tell the autopilot, the ground station and systemd how it goes, where it is time for that."""

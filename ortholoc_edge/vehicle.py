@@ -117,14 +117,6 @@ class Vehicle:
         except MapError:
             return None
 
-    def height_amsl_m(self, stamp_ns: int) -> float | None:
-        """As the autopilot's filter believes; None where it tells none."""
-        known = self._link.state_at(stamp_ns)
-        if known is None or known.local_position_ned_m is None or known.origin is None:
-            return None
-        height_m = known.origin.height_amsl_m - float(known.local_position_ned_m[2])
-        return height_m if math.isfinite(height_m) else None
-
     def _gimbal_mount(self, known: AutopilotState) -> CameraMount | None:
         if known.ned_from_gimbal is None or known.ned_from_body is None:
             return None

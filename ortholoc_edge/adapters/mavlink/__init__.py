@@ -10,10 +10,9 @@ from ortholoc_edge.adapters.mavlink.gimbal import GimbalSelection
 from ortholoc_edge.adapters.mavlink.link import AutopilotLink
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus
 from ortholoc_edge.adapters.mavlink.protocol import Statistic
-from ortholoc_edge.adapters.mavlink.requests import PositionRequest
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity, AutopilotState, GnssPosition
 
 __all__ = [
     "AutopilotIdentity", "AutopilotLink", "AutopilotState", "GimbalSelection", "GnssPosition", "LinkOptions",
-    "MavlinkMessage", "PositionRequest", "Severity", "Statistic", "SystemStatus",
+    "MavlinkMessage", "Severity", "Statistic", "SystemStatus",
 ]  # fmt: skip

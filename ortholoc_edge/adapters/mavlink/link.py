@@ -28,7 +28,6 @@ from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, System
 from ortholoc_edge.adapters.mavlink.parameters import Number, Reading, Written
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol, Statistic
 from ortholoc_edge.adapters.mavlink.release import MAX_AGE_MS
-from ortholoc_edge.adapters.mavlink.requests import PositionRequest, acknowledgement
 from ortholoc_edge.adapters.mavlink.signing import ACCEPTED, STORE_INTERVAL_S, Verdict, make_signing
 from ortholoc_edge.adapters.mavlink.sinks import Sink
 from ortholoc_edge.adapters.mavlink.sources import Outcome
@@ -538,16 +537,6 @@ class AutopilotLink:
         self._log(self._clock.now_ns(), logging.ERROR, "internal", f"autopilot link: one item was left out\n{told}")
         return error
 
-    def take_request(self) -> PositionRequest | None:
-        """A position that somebody sent us, once; to be answered."""
-        with self._lock:
-            return self._protocol.take_request()
-
-    def answer_request(self, request: PositionRequest, accepted: bool) -> None:
-        """Tell who sent it what became of it."""
-        with self._lock:
-            self._protocol.answers.append(acknowledgement(request.system, request.component, accepted))
-
     def _wait_s(self) -> float:
         """Until something is due, and never long."""
         with self._lock:
@@ -634,8 +623,6 @@ class AutopilotLink:
                     self._counts["estimates_dropped"] += 1
             else:
                 encoded = []
-            while self._protocol.answers:
-                messages.append(self._protocol.answers.popleft())
             while self._texts:
                 messages.append(self._texts.popleft())
         went_out = {message.get_type() for message in encoded if self._send(transport, message)}

@@ -60,8 +60,6 @@ class LinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         switch_sources: whether we may tell ArduPilot to take another source set (MAV_CMD_SET_EKF_SOURCE_SET) when
             GNSS contradicts vision, and back. vision_source_set, gnss_source_set: n of EK3_SRCn_*. Only where ``send``
             has a message for ExternalNav: to a source set all GPS instances are one source.
-        accept_position: whether a MAV_CMD_EXTERNAL_POSITION_ESTIMATE to our own component says where to search. Whoever
-            reaches the link may then lead the search, unless ``require_signed``.
         computer_status_rate_hz: of ONBOARD_COMPUTER_STATUS; 0 sends none.
         quality_rate_hz: of the three NAMED_VALUE_FLOAT about the last estimate; 0 sends none.
         signing_key: path of MAVLink 2's signing key, or the name of a systemd credential; None signs nothing and
@@ -92,7 +90,6 @@ class LinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     switch_sources: bool = False
     vision_source_set: Annotated[int, msgspec.Meta(ge=1, le=3)] = 2
     gnss_source_set: Annotated[int, msgspec.Meta(ge=1, le=3)] = 1
-    accept_position: bool = False
     computer_status_rate_hz: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.2
     quality_rate_hz: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.5
     signing_key: Annotated[str, msgspec.Meta(min_length=1)] | None = None

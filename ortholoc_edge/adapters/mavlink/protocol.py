@@ -20,7 +20,6 @@ from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, System
 from ortholoc_edge.adapters.mavlink.outlet import Outlet
 from ortholoc_edge.adapters.mavlink.parameters import ParameterClient
 from ortholoc_edge.adapters.mavlink.release import MAX_AGE_MS, Outgoing, Release
-from ortholoc_edge.adapters.mavlink.requests import PositionRequest, acknowledgement, position_request
 from ortholoc_edge.adapters.mavlink.sinks import Sink
 from ortholoc_edge.adapters.mavlink.sources import PendingSwitch
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity, AutopilotState
@@ -78,8 +77,6 @@ class LinkProtocol:
         self._log = LimitedLog()
         self.system_status = SystemStatus.BOOT
         self.computer: ComputerStatus | None = None
-        # To requests; sent with the next messages.
-        self.answers: deque[MavlinkMessage] = deque(maxlen=8)
         self._last_sent: Outgoing | None = None
         self._sent_ns: int | None = None
         self._local_sent_ns: int | None = None
@@ -93,7 +90,6 @@ class LinkProtocol:
         self.latency = LatencyMeter()
         self.monitor = FusionMonitor()
         self.source_set = PendingSwitch()
-        self._requests: deque[PositionRequest] = deque(maxlen=4)
         self._texts_told: OrderedDict[str, int] = OrderedDict()
         self._advice: DelayAdvice | None = None
         self.parameters = ParameterClient()
@@ -194,8 +190,6 @@ class LinkProtocol:
         if name == "HEARTBEAT" and component == _AUTOPILOT_COMPONENT:
             self._on_heartbeat(message, system, arrival_ns)
             return
-        if self._options.accept_position and self._take_request(message):
-            return
         if self._vehicle is None or (system, component) != (self._vehicle.system_id, _AUTOPILOT_COMPONENT):
             ours = self._vehicle is not None and system == self._vehicle.system_id
             taken = ours and self.telemetry.take_of_component(message, arrival_ns)
@@ -215,24 +209,6 @@ class LinkProtocol:
         handler = self._handlers.get(name)
         if handler is not None:
             handler(message, arrival_ns)
-
-    def _take_request(self, message: MavlinkMessage) -> bool:
-        """Whether it was one, good or bad."""
-        try:
-            request = position_request(message, self.own_system_id, self._options.component_id)
-        except ValueError as error:
-            self.counts["positions_refused"] += 1
-            sender = message.get_srcSystem(), message.get_srcComponent()
-            logger.warning("a position from system %d, component %d is refused: %s", *sender, error)
-            self.answers.append(acknowledgement(*sender, accepted=False))
-            return True
-        if request is not None:
-            self._requests.append(request)
-        return request is not None
-
-    def take_request(self) -> PositionRequest | None:
-        """The position that was sent to us, once; who sent it is to be answered through ``answers``."""
-        return self._requests.popleft() if self._requests else None
 
     def is_vehicle_heartbeat(self, message: MavlinkMessage) -> bool:
         """Whether this is the heartbeat of an autopilot that we may serve, not of a ground station or a
