@@ -18,7 +18,7 @@ from ortholoc_edge.adapters.messages import COMMANDS, JSON, MSGPACK, Command, Co
 
 T = TypeVar("T")
 
-# The largest command, a polygon of 50 corners, is of 2 kB.
+# The largest command is of 200 bytes.
 MOST_BYTES = 4096
 _MOST_WAITING = 4
 # As zenoh says that nothing was said.

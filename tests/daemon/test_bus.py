@@ -360,13 +360,6 @@ HOSTILE: dict[str, tuple[str, bytes, str | None, str]] = {
     "out of range": ("set_prior", json.dumps({**PRIOR, "lat_deg": 91.0}).encode(), None, r"<= 90.*lat_deg"),
     "of no width": ("set_prior", json.dumps({**PRIOR, "sigma_horizontal_m": 0}).encode(), None, "sigma_horizontal_m"),
     "wrong type": ("set_prior", json.dumps({**PRIOR, "lat_deg": "47"}).encode(), None, r"got `str`.*lat_deg"),
-    "two corners": ("search", b'{"polygon": [[47, 11], [47, 12]]}', None, "length >= 3"),
-    "many corners": ("search", json.dumps({"polygon": [[47, 11]] * 51}).encode(), None, "length <= 50"),
-    "corner beyond a pole": ("search", b'{"polygon": [[47, 11], [47, 12], [97, 12]]}', None, "<= 90.*polygon"),
-    "corner of three": ("search", b'{"polygon": [[47, 11], [47, 12], [47, 12, 3]]}', None, "length 2.*polygon"),
-    "NaN corner": (
-        "search", msgspec.msgpack.encode({"polygon": [[47, 11], [47, 12], [float("nan"), 12]]}), MSGPACK, "polygon",
-    ),
     "no object": ("resume", b"[1, 2]", None, "got `array`"),
     "unknown field": ("relocalize", b'{"speed": 3}', None, "unknown field `speed`"),
     "another encoding": ("pause", b"{}", "application/xml", "'application/xml' is not understood"),
