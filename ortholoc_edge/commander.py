@@ -12,14 +12,25 @@ from pathlib import Path
 
 import cv2
 import msgspec
+import numpy as np
 
 from ortholoc_edge.adapters.commands import Answer
 from ortholoc_edge.adapters.flight_log import FlightLog, LoggedStep
 from ortholoc_edge.adapters.mavlink import AutopilotLink, Severity
-from ortholoc_edge.adapters.messages import Command, CommandReply, Pause, Relocalize, Resume, SetPrior, Statistic
+from ortholoc_edge.adapters.messages import (
+    Command,
+    CommandReply,
+    Pause,
+    Relocalize,
+    Resume,
+    SearchFor,
+    SetPrior,
+    Statistic,
+)
 from ortholoc_edge.clock import Clock, wall_clock_ns
 from ortholoc_edge.errors import MapError
-from ortholoc_edge.geometry.arrays import ImageArray
+from ortholoc_edge.geometry import polygon
+from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
 from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.navigator import Navigator
 from ortholoc_edge.pipeline.outcome import Outcome
@@ -34,6 +45,10 @@ _S = 1_000_000_000
 _MOST_SNAPSHOTS = 100
 # For a typical height of the ground.
 _GROUND_GSD_M = 4.0
+# A polygon that reaches further beyond the pack is a slip: latitude and longitude swapped, a digit lost.
+_FURTHEST_M = 100_000.0
+# Less is no area for a vehicle.
+_LEAST_AREA_M2 = 1.0
 
 
 class Commander:
@@ -56,15 +71,18 @@ class Commander:
         lost_sigma_m: float,
         log: FlightLog | None,
         snapshots: Path | None,
+        search_in: Callable[[FloatArray | None, int], None] | None,
     ) -> None:
         """
         Args:
             counts: of the owner, to which ``commands`` is added.
             snapshots: folder for them; None: nowhere.
+            search_in: has the map searched at once, inside of corners (N, 2) of the map or everywhere (None), at a
+                time of the clock; None: it is not searched at all.
         """
         self._navigator, self._store, self._link, self._clock = navigator, store, link, clock
         self._counts, self._statistics = counts, statistics
-        self._log, self._snapshots = log, snapshots
+        self._log, self._snapshots, self._search_in = log, snapshots, search_in
         self._last: tuple[Frame, Outcome, LoggedStep | None] | None = None
         self.lost_sigma_m = lost_sigma_m
         self.paused = False
@@ -82,6 +100,8 @@ class Commander:
                 answer = self._relocalize(command, now_ns)
             case SetPrior():
                 answer = self._set_prior(command, now_ns)
+            case SearchFor():
+                answer = self._search(command, now_ns)
             case Pause():
                 answer = self._pause(paused=True)
             case Resume():
@@ -139,6 +159,25 @@ class Commander:
             )
         )
         return CommandReply(command="set_prior", accepted=True)
+
+    def _search(self, command: SearchFor, now_ns: int) -> CommandReply:
+        if self._search_in is None:
+            return _refused(
+                "search",
+                "this vehicle does not search the map",
+                "set [search] enabled = true and restart it, or send set_prior",
+            )
+        corners = None
+        if command.polygon is not None:
+            try:
+                corners = polygon.without_repeats(self._store.pack.georeference.map_from_lat_lon(command.polygon))
+            except MapError as error:
+                return _refused("search", str(error), "send a polygon that overlaps the pack")
+            reason = _why_not(corners, self._store.bounds)
+            if reason is not None:
+                return _refused("search", *reason)
+        self._search_in(corners, now_ns)
+        return CommandReply(command="search", accepted=True)
 
     def _pause(self, *, paused: bool) -> CommandReply:
         name = "pause" if paused else "resume"
@@ -200,6 +239,26 @@ def _written(path: Path, data: bytes) -> None:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
         raise
+
+
+def _why_not(corners: FloatArray, bounds: tuple[float, float, float, float]) -> tuple[str, str] | None:
+    """Reason and remedy why a polygon (N, 2), m, can't be searched in the map's box; None if it can."""
+    if len(corners) < 3:
+        return f"the polygon has {len(corners)} different corners", "send three or more"
+    west, south, east, north = bounds
+    beyond_m = float(np.max((west, south) - corners)), float(np.max(corners - (east, north)))
+    if max(beyond_m) > _FURTHEST_M:
+        return (
+            f"the polygon reaches {max(beyond_m) / 1e3:.0f} km beyond the pack",
+            "send corners as (latitude, longitude), near the pack",
+        )
+    if polygon.crosses_itself(corners):
+        return "the polygon's sides cross or touch", "send its corners in order, once around"
+    if polygon.area(corners) < _LEAST_AREA_M2:
+        return "the polygon has no area", "send a wider one"
+    if polygon.area(polygon.clipped(corners, bounds)) < _LEAST_AREA_M2:
+        return "the polygon is outside of the pack", "send one that overlaps it"
+    return None
 
 
 def _refused(command: str, reason: str, remedy: str) -> CommandReply:

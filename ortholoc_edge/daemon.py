@@ -188,6 +188,7 @@ class Daemon:
                 lost_sigma_m=config.tracker.lost_sigma_m,
                 log=self._log,
                 snapshots=_snapshot_folder(config),
+                search_in=None,
             )
             self._bus = (
                 resources.enter_context(closing(bus_of(config.bus, config.camera, os.environ)))

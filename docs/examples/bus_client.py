@@ -79,8 +79,8 @@ def main() -> int:
     parser.add_argument("--vehicle", default="vehicle", help="(default: %(default)s)")
     parser.add_argument("--seconds", type=float, default=1e9, help="how long to follow (default: for ever)")
     parser.add_argument("--ask", metavar="KEY", help="fix, state, health, config, stats")
-    parser.add_argument("--command", nargs="+", metavar=("NAME", "JSON"), help="relocalize, set_prior, pause, resume, "
-                        "snapshot")  # fmt: skip
+    parser.add_argument("--command", nargs="+", metavar=("NAME", "JSON"), help="relocalize, set_prior, search, pause, "
+                        "resume, snapshot")  # fmt: skip
     args = parser.parse_args()
     with open_session(args.connect) as session:
         if args.command:

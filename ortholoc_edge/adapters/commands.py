@@ -18,8 +18,8 @@ from ortholoc_edge.adapters.messages import COMMANDS, JSON, MSGPACK, Command, Co
 
 T = TypeVar("T")
 
-# The largest command is of 200 bytes.
-MOST_BYTES = 4096
+# The largest command is a polygon of 100 corners: 4 KB as JSON with all digits, twice that where it is indented.
+MOST_BYTES = 16384
 _MOST_WAITING = 4
 # As zenoh says that nothing was said.
 _UNSAID = ("", "zenoh/bytes", "text/json", "zenoh/string", "text/plain")

@@ -252,6 +252,21 @@ class SetPrior(_Command, frozen=True, kw_only=True):
     sigma_vertical_m: Annotated[float, Meta(ge=1, le=500)]
 
 
+Latitude = Annotated[float, Meta(ge=-90, le=90)]
+Longitude = Annotated[float, Meta(ge=-180, le=180)]
+
+
+class SearchFor(_Command, frozen=True, kw_only=True):
+    """``…/command/search``: search the map at once, without regard to where the vehicle is believed to be.
+
+    Attributes:
+        polygon: corners (latitude, longitude) on WGS 84, degrees, of the area where the vehicle is; nowhere else is
+            searched until it was found there. None: anywhere on the map, and a polygon given before is forgotten.
+    """
+
+    polygon: Annotated[tuple[tuple[Latitude, Longitude], ...], Meta(min_length=3, max_length=100)] | None = None
+
+
 class Pause(_Command, frozen=True, kw_only=True):
     """``…/command/pause``: localize no more frames, send nothing to the autopilot."""
 
@@ -264,7 +279,7 @@ class Snapshot(_Command, frozen=True, kw_only=True):
     """``…/command/snapshot``: write the last frame and what it came to into a file on the vehicle."""
 
 
-Command = Relocalize | SetPrior | Pause | Resume | Snapshot
+Command = Relocalize | SetPrior | SearchFor | Pause | Resume | Snapshot
 
 
 class CommandReply(Struct, frozen=True, kw_only=True):
@@ -296,6 +311,7 @@ ASKED: dict[str, type[Struct]] = {"config": ConfigMessage, "stats": StatsMessage
 COMMANDS: dict[str, type[Command]] = {
     "relocalize": Relocalize,
     "set_prior": SetPrior,
+    "search": SearchFor,
     "pause": Pause,
     "resume": Resume,
     "snapshot": Snapshot,
