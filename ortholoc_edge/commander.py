@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import datetime
 import logging
+import math
 import os
 from collections import Counter
 from collections.abc import Callable
@@ -16,7 +17,7 @@ import numpy as np
 
 from ortholoc_edge.adapters.commands import Answer
 from ortholoc_edge.adapters.flight_log import FlightLog, LoggedStep
-from ortholoc_edge.adapters.mavlink import AutopilotLink, Severity
+from ortholoc_edge.adapters.mavlink import AutopilotLink, GivenPlace, Severity
 from ortholoc_edge.adapters.messages import (
     Command,
     CommandReply,
@@ -49,6 +50,11 @@ _GROUND_GSD_M = 4.0
 _FURTHEST_M = 100_000.0
 # Less is no area for a vehicle.
 _LEAST_AREA_M2 = 1.0
+# Of a height that the autopilot believes, its barometer's drift and a wrong origin included; and at least of one
+# that somebody gave.
+_HEIGHT_SIGMA_M = 30.0
+# Of `SetPrior`.
+_MOST_SIGMA_M = 500.0
 
 
 class Commander:
@@ -116,6 +122,46 @@ class Commander:
         if self._log is not None:
             self._log.command(now_ns, command, said)
         return answer
+
+    def take_place(self, place: GivenPlace) -> bool:
+        """A position by MAVLink, as `SetPrior`: whether it is taken; why not is told as a text."""
+        reply = self._placed(place)
+        if not reply.accepted:
+            logger.warning("position by MAVLink refused: %s; %s", reply.reason, reply.remedy)
+            self._link.send_status_text(Severity.WARNING, f"OrthoLoC: position refused: {reply.reason}")
+        return reply.accepted
+
+    def _placed(self, place: GivenPlace) -> CommandReply:
+        state = self._link.state_at(self._clock.now_ns())
+        height_m, speed_m_s = place.height_amsl_m, 0.0
+        if state is not None and state.velocity_ned is not None:
+            speed_m_s = float(np.hypot(*state.velocity_ned[:2]))
+        # What is believed aboard comes first: an operator sees a place on a map, and rarely a height.
+        if state is not None and state.origin is not None and state.local_position_ned_m is not None:
+            height_m = state.origin.height_amsl_m - float(state.local_position_ned_m[2])
+        if height_m is None:
+            return _refused("set_prior", "the autopilot tells no height", "send one, above mean sea level")
+        if place.sigma_m is None:
+            sigma_m = min(_MOST_SIGMA_M, self.lost_sigma_m)
+        else:
+            # Whichever way it flew since.
+            sigma_m = math.hypot(place.sigma_m, speed_m_s * place.age_s)
+        try:
+            command = msgspec.convert(
+                {
+                    "lat_deg": place.lat_deg,
+                    "lon_deg": place.lon_deg,
+                    "height_amsl_m": height_m,
+                    "sigma_horizontal_m": max(1.0, sigma_m),
+                    "sigma_vertical_m": _HEIGHT_SIGMA_M,
+                },
+                SetPrior,
+            )
+        except msgspec.ValidationError as error:
+            return _refused("set_prior", str(error), "send a position of this vehicle")
+        reply = self.carry_out(command)
+        assert isinstance(reply, CommandReply)
+        return reply
 
     def _relocalize(self, command: Relocalize, now_ns: int) -> CommandReply:
         if not (self._navigator.tracker.witness.trusted or command.trust_gnss):

@@ -190,6 +190,7 @@ class Daemon:
                 snapshots=_snapshot_folder(config),
                 search_in=None,
             )
+            self._link.take_places(lambda place: self._desk.leave(lambda: self._commander.take_place(place)))
             self._bus = (
                 resources.enter_context(closing(bus_of(config.bus, config.camera, os.environ)))
                 if config.bus.enabled

@@ -85,16 +85,23 @@ class Desk:
     def __init__(self) -> None:
         self._waiting: queue.Queue[tuple[Callable[[], Any], Future[Any]]] = queue.Queue(_MOST_WAITING)
 
+    def leave(self, task: Callable[[], T]) -> Future[T] | None:
+        """Have it done, and go on: what it comes to. Who gives it up cancels that. None: too many wait already."""
+        future: Future[T] = Future()
+        try:
+            self._waiting.put_nowait((task, future))
+        except queue.Full:
+            return None
+        return future
+
     def ask(self, task: Callable[[], T], timeout_s: float) -> T:
         """What ``task`` returns, done by the thread that serves.
 
         Raises: BusyError if it was not begun in time, and what it raised.
         """
-        future: Future[T] = Future()
-        try:
-            self._waiting.put_nowait((task, future))
-        except queue.Full:
-            raise BusyError(f"{_MOST_WAITING} tasks wait already") from None
+        future = self.leave(task)
+        if future is None:
+            raise BusyError(f"{_MOST_WAITING} tasks wait already")
         try:
             return future.result(timeout_s)
         except TimeoutError:
