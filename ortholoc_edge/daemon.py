@@ -14,6 +14,7 @@ import os
 import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -317,7 +318,12 @@ class Daemon:
         fixed = config.mount.body_from_camera() if config.mount.gimbal_selection() is None else None
         about = {"matcher": self._matcher.name, "vehicle": config.bus.vehicle}
         listen = checked(config.page, os.environ)
-        return GroundPage(listen, self._clock, self._store, config.intrinsics.camera(), fixed, about)
+
+        def leave(command: Command) -> Future[Answer] | None:
+            return self._desk.leave(lambda: self._carry_out(command))
+
+        taker = leave if config.page.commands else None
+        return GroundPage(listen, self._clock, self._store, config.intrinsics.camera(), fixed, about, taker)
 
     @property
     def link(self) -> AutopilotLink:
