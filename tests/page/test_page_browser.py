@@ -245,7 +245,8 @@ def test_an_area_is_drawn_with_a_finger_and_sent(browser: Chromium, store: MapSt
         future.set_result(replies[len(commands) - 1])
         return future
 
-    token = b"0123456789abcdef"
+    # Its own: cookies are of all ports of the host, and the browser is shared.
+    token = b"drawn-0123456789abcdef"
     feeder = Feeder(store, Listen("127.0.0.1", free_port(), False, token, frozenset()), leave)
     try:
         wait(lambda: feeder.page.address is not None)
