@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import datetime
 import logging
+import math
 import os
 from collections import Counter
 from collections.abc import Callable
@@ -16,7 +17,7 @@ import numpy as np
 
 from ortholoc_edge.adapters.commands import Answer
 from ortholoc_edge.adapters.flight_log import FlightLog, LoggedStep
-from ortholoc_edge.adapters.mavlink import AutopilotLink, Severity
+from ortholoc_edge.adapters.mavlink import AutopilotLink, GivenPlace, Severity
 from ortholoc_edge.adapters.messages import (
     Command,
     CommandReply,
@@ -29,14 +30,13 @@ from ortholoc_edge.adapters.messages import (
 )
 from ortholoc_edge.clock import Clock, wall_clock_ns
 from ortholoc_edge.errors import MapError
+from ortholoc_edge.geometry import polygon
 from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
-from ortholoc_edge.pipeline.finder import Finder
 from ortholoc_edge.pipeline.frame import Frame
 from ortholoc_edge.pipeline.navigator import Navigator
 from ortholoc_edge.pipeline.outcome import Outcome
 from ortholoc_edge.pipeline.record import frame_record, outcome_record
 from ortholoc_edge.pipeline.tracker import GivenPosition, StartAnew
-from ortholoc_edge.tiles.lattice import Bounds
 from ortholoc_edge.tiles.store import MapStore
 
 logger = logging.getLogger(__name__)
@@ -44,9 +44,17 @@ logger = logging.getLogger(__name__)
 _S = 1_000_000_000
 # Of a megabyte or less each: who needs more wants a flight log with all frames.
 _MOST_SNAPSHOTS = 100
-_LEAST_AREA_M2 = 1000.0
 # For a typical height of the ground.
 _GROUND_GSD_M = 4.0
+# A polygon that reaches further beyond the pack is a slip: latitude and longitude swapped, a digit lost.
+_FURTHEST_M = 100_000.0
+# Less is no area for a vehicle.
+_LEAST_AREA_M2 = 1.0
+# Of a height that the autopilot believes, its barometer's drift and a wrong origin included; and at least of one
+# that somebody gave.
+_HEIGHT_SIGMA_M = 30.0
+# Of `SetPrior`.
+_MOST_SIGMA_M = 500.0
 
 
 class Commander:
@@ -67,19 +75,20 @@ class Commander:
         statistics: Callable[[], dict[str, Statistic]],
         *,
         lost_sigma_m: float,
-        finder: Finder | None,
         log: FlightLog | None,
         snapshots: Path | None,
+        search_in: Callable[[FloatArray | None, int], None] | None,
     ) -> None:
         """
         Args:
             counts: of the owner, to which ``commands`` is added.
-            finder: that searches the map; None: it is switched off.
             snapshots: folder for them; None: nowhere.
+            search_in: has the map searched at once, inside of corners (N, 2) of the map or everywhere (None), at a
+                time of the clock; None: it is not searched at all.
         """
         self._navigator, self._store, self._link, self._clock = navigator, store, link, clock
         self._counts, self._statistics = counts, statistics
-        self._finder, self._log, self._snapshots = finder, log, snapshots
+        self._log, self._snapshots, self._search_in = log, snapshots, search_in
         self._last: tuple[Frame, Outcome, LoggedStep | None] | None = None
         self.lost_sigma_m = lost_sigma_m
         self.paused = False
@@ -113,6 +122,46 @@ class Commander:
         if self._log is not None:
             self._log.command(now_ns, command, said)
         return answer
+
+    def take_place(self, place: GivenPlace) -> bool:
+        """A position by MAVLink, as `SetPrior`: whether it is taken; why not is told as a text."""
+        reply = self._placed(place)
+        if not reply.accepted:
+            logger.warning("position by MAVLink refused: %s; %s", reply.reason, reply.remedy)
+            self._link.send_status_text(Severity.WARNING, f"OrthoLoC: position refused: {reply.reason}")
+        return reply.accepted
+
+    def _placed(self, place: GivenPlace) -> CommandReply:
+        state = self._link.state_at(self._clock.now_ns())
+        height_m, speed_m_s = place.height_amsl_m, 0.0
+        if state is not None and state.velocity_ned is not None:
+            speed_m_s = float(np.hypot(*state.velocity_ned[:2]))
+        # What is believed aboard comes first: an operator sees a place on a map, and rarely a height.
+        if state is not None and state.origin is not None and state.local_position_ned_m is not None:
+            height_m = state.origin.height_amsl_m - float(state.local_position_ned_m[2])
+        if height_m is None:
+            return _refused("set_prior", "the autopilot tells no height", "send one, above mean sea level")
+        if place.sigma_m is None:
+            sigma_m = min(_MOST_SIGMA_M, self.lost_sigma_m)
+        else:
+            # Whichever way it flew since.
+            sigma_m = math.hypot(place.sigma_m, speed_m_s * place.age_s)
+        try:
+            command = msgspec.convert(
+                {
+                    "lat_deg": place.lat_deg,
+                    "lon_deg": place.lon_deg,
+                    "height_amsl_m": height_m,
+                    "sigma_horizontal_m": max(1.0, sigma_m),
+                    "sigma_vertical_m": _HEIGHT_SIGMA_M,
+                },
+                SetPrior,
+            )
+        except msgspec.ValidationError as error:
+            return _refused("set_prior", str(error), "send a position of this vehicle")
+        reply = self.carry_out(command)
+        assert isinstance(reply, CommandReply)
+        return reply
 
     def _relocalize(self, command: Relocalize, now_ns: int) -> CommandReply:
         if not (self._navigator.tracker.witness.trusted or command.trust_gnss):
@@ -158,23 +207,22 @@ class Commander:
         return CommandReply(command="set_prior", accepted=True)
 
     def _search(self, command: SearchFor, now_ns: int) -> CommandReply:
-        if self._finder is None:
-            return _refused("search", "the search is switched off", "set [search] enabled in the configuration")
-        corners: FloatArray | None = None
+        if self._search_in is None:
+            return _refused(
+                "search",
+                "this vehicle does not search the map",
+                "set [search] enabled = true and restart it, or send set_prior",
+            )
+        corners = None
         if command.polygon is not None:
             try:
-                corners = np.array(
-                    [
-                        self._store.pack.georeference.map_from_geodetic(lat, lon, height_amsl_m=0.0)[:2]
-                        for lat, lon in command.polygon
-                    ]
-                )
+                corners = polygon.without_repeats(self._store.pack.georeference.map_from_lat_lon(command.polygon))
             except MapError as error:
-                return _refused("search", str(error), "send corners near the pack")
-            why = unusable_area(corners, self._store.bounds)
-            if why is not None:
-                return _refused("search", why, "send the corners in order, (latitude, longitude), over the pack")
-        self._finder.search_in(corners, now_ns)
+                return _refused("search", str(error), "send a polygon that overlaps the pack")
+            reason = _why_not(corners, self._store.bounds)
+            if reason is not None:
+                return _refused("search", *reason)
+        self._search_in(corners, now_ns)
         return CommandReply(command="search", accepted=True)
 
     def _pause(self, *, paused: bool) -> CommandReply:
@@ -202,39 +250,6 @@ class Commander:
         )
         folder = self._snapshots
         return lambda: _write_snapshot(folder, frame.image, content)
-
-
-def unusable_area(corners: FloatArray, bounds: Bounds) -> str | None:
-    """Why a polygon (N, 2) is none to search in; None where it is one.
-
-    Args:
-        bounds: of the map.
-    """
-    west, south, east, north = bounds
-    if (corners.max(axis=0) <= (west, south)).any() or (corners.min(axis=0) >= (east, north)).any():
-        return "the polygon is outside of the pack"
-    ends = np.roll(corners, -1, axis=0)
-    for i in range(len(corners)):
-        for j in range(i + 2, len(corners)):
-            # The first and the last have a corner in common.
-            if not (i == 0 and j == len(corners) - 1) and _cross(corners[i], ends[i], corners[j], ends[j]):
-                return f"the polygon's sides {i + 1} and {j + 1} cross"
-    # To its middle, or nothing is left of the numbers' precision.
-    x, y = (corners - corners.mean(axis=0)).T
-    area_m2 = 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
-    if area_m2 < _LEAST_AREA_M2:
-        return f"the polygon has an area of {area_m2:.0f} m2, and a view takes {_LEAST_AREA_M2:.0f}"
-    return None
-
-
-def _cross(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> bool:
-    """Whether the lines from a to b and from c to d do."""
-
-    def side(p: FloatArray, q: FloatArray, r: FloatArray) -> float:
-        (px, py), (qx, qy) = (q - p).tolist(), (r - p).tolist()
-        return float(px * qy - py * qx)
-
-    return side(a, b, c) * side(a, b, d) < 0.0 and side(c, d, a) * side(c, d, b) < 0.0
 
 
 def _write_snapshot(folder: Path, image: ImageArray, content: bytes) -> CommandReply:
@@ -270,6 +285,26 @@ def _written(path: Path, data: bytes) -> None:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
         raise
+
+
+def _why_not(corners: FloatArray, bounds: tuple[float, float, float, float]) -> tuple[str, str] | None:
+    """Reason and remedy why a polygon (N, 2), m, can't be searched in the map's box; None if it can."""
+    if len(corners) < 3:
+        return f"the polygon has {len(corners)} different corners", "send three or more"
+    west, south, east, north = bounds
+    beyond_m = float(np.max((west, south) - corners)), float(np.max(corners - (east, north)))
+    if max(beyond_m) > _FURTHEST_M:
+        return (
+            f"the polygon reaches {max(beyond_m) / 1e3:.0f} km beyond the pack",
+            "send corners as (latitude, longitude), near the pack",
+        )
+    if polygon.crosses_itself(corners):
+        return "the polygon's sides cross or touch", "send its corners in order, once around"
+    if polygon.area(corners) < _LEAST_AREA_M2:
+        return "the polygon has no area", "send a wider one"
+    if polygon.area(polygon.clipped(corners, bounds)) < _LEAST_AREA_M2:
+        return "the polygon is outside of the pack", "send one that overlaps it"
+    return None
 
 
 def _refused(command: str, reason: str, remedy: str) -> CommandReply:

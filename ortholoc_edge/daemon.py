@@ -14,6 +14,7 @@ import os
 import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -186,10 +187,11 @@ class Daemon:
                 self._counts,
                 self.statistics,
                 lost_sigma_m=config.tracker.lost_sigma_m,
-                finder=self._finder,
                 log=self._log,
                 snapshots=_snapshot_folder(config),
+                search_in=None if self._finder is None else self._finder.search_in,
             )
+            self._link.take_places(lambda place: self._desk.leave(lambda: self._commander.take_place(place)))
             self._bus = (
                 resources.enter_context(closing(bus_of(config.bus, config.camera, os.environ)))
                 if config.bus.enabled
@@ -317,7 +319,12 @@ class Daemon:
         fixed = config.mount.body_from_camera() if config.mount.gimbal_selection() is None else None
         about = {"matcher": self._matcher.name, "vehicle": config.bus.vehicle}
         listen = checked(config.page, os.environ)
-        return GroundPage(listen, self._clock, self._store, config.intrinsics.camera(), fixed, about)
+
+        def leave(command: Command) -> Future[Answer] | None:
+            return self._desk.leave(lambda: self._carry_out(command))
+
+        taker = leave if config.page.commands else None
+        return GroundPage(listen, self._clock, self._store, config.intrinsics.camera(), fixed, about, taker)
 
     @property
     def link(self) -> AutopilotLink:

@@ -18,8 +18,8 @@ from ortholoc_edge.adapters.messages import COMMANDS, JSON, MSGPACK, Command, Co
 
 T = TypeVar("T")
 
-# The largest command is of 200 bytes.
-MOST_BYTES = 4096
+# The largest command is a polygon of 100 corners: 4 KB as JSON with all digits, twice that where it is indented.
+MOST_BYTES = 16384
 _MOST_WAITING = 4
 # As zenoh says that nothing was said.
 _UNSAID = ("", "zenoh/bytes", "text/json", "zenoh/string", "text/plain")
@@ -85,16 +85,23 @@ class Desk:
     def __init__(self) -> None:
         self._waiting: queue.Queue[tuple[Callable[[], Any], Future[Any]]] = queue.Queue(_MOST_WAITING)
 
+    def leave(self, task: Callable[[], T]) -> Future[T] | None:
+        """Have it done, and go on: what it comes to. Who gives it up cancels that. None: too many wait already."""
+        future: Future[T] = Future()
+        try:
+            self._waiting.put_nowait((task, future))
+        except queue.Full:
+            return None
+        return future
+
     def ask(self, task: Callable[[], T], timeout_s: float) -> T:
         """What ``task`` returns, done by the thread that serves.
 
         Raises: BusyError if it was not begun in time, and what it raised.
         """
-        future: Future[T] = Future()
-        try:
-            self._waiting.put_nowait((task, future))
-        except queue.Full:
-            raise BusyError(f"{_MOST_WAITING} tasks wait already") from None
+        future = self.leave(task)
+        if future is None:
+            raise BusyError(f"{_MOST_WAITING} tasks wait already")
         try:
             return future.result(timeout_s)
         except TimeoutError:

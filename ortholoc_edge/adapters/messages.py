@@ -254,18 +254,19 @@ class SetPrior(_Command, frozen=True, kw_only=True):
     sigma_vertical_m: Annotated[float, Meta(ge=1, le=500)]
 
 
-_Corner = tuple[Annotated[float, Meta(ge=-90, le=90)], Annotated[float, Meta(ge=-180, le=180)]]
+Latitude = Annotated[float, Meta(ge=-90, le=90)]
+Longitude = Annotated[float, Meta(ge=-180, le=180)]
 
 
 class SearchFor(_Command, frozen=True, kw_only=True):
-    """``…/command/search``: look for the vehicle in the map at once, whatever the track says.
+    """``…/command/search``: search the map at once, without regard to where the vehicle is believed to be.
 
     Attributes:
-        polygon: corners of the area that it is in, as (latitude, longitude), WGS 84, in order; it is looked for nowhere
-            else until it was found there. None: everywhere, and an area that was given before is forgotten.
+        polygon: corners (latitude, longitude) on WGS 84, degrees, of the area where the vehicle is; nowhere else is
+            searched until it was found there. None: anywhere on the map, and a polygon given before is forgotten.
     """
 
-    polygon: Annotated[tuple[_Corner, ...], Meta(min_length=3, max_length=50)] | None = None
+    polygon: Annotated[tuple[tuple[Latitude, Longitude], ...], Meta(min_length=3, max_length=100)] | None = None
 
 
 class Pause(_Command, frozen=True, kw_only=True):

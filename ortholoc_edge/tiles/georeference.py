@@ -282,6 +282,14 @@ class Georeference:
             raise self.vertical.unknown(wanted)
         return np.array([x, y, height_m - offset_m])
 
+    def map_from_lat_lon(self, lat_lon_deg: npt.ArrayLike) -> FloatArray:
+        """Map positions (N, 2) of WGS 84 latitudes and longitudes (N, 2), without heights.
+
+        Raises: MapError where the pack has no CRS, or one of them has no image in the projection.
+        """
+        lat, lon = np.asarray(lat_lon_deg, dtype=np.float64).reshape(-1, 2).T.tolist()
+        return self._transformed(_WGS84, self._projected(), lon, lat)
+
     def amsl_minus_map_m(self, xy_map: npt.ArrayLike) -> float | None:
         """What to add to a map height at a map position (2,) for AMSL (EGM96), m; None: not known."""
         x, y = np.asarray(xy_map, dtype=np.float64)

@@ -231,6 +231,7 @@ class FakeAutopilot:
             "GLOBAL_POSITION_SENSOR",
             "GPS_INPUT",
             "COMMAND_INT",
+            "COMMAND_ACK",
             "STATUSTEXT",
             "HEARTBEAT",
             "SET_GPS_GLOBAL_ORIGIN",

@@ -36,6 +36,7 @@ from ortholoc_edge.adapters.messages import (
     CommandReply,
     ConfigMessage,
     FixMessage,
+    SearchFor,
     SetPrior,
     StatsMessage,
     fix_message,
@@ -330,6 +331,16 @@ def test_a_command_is_carried_out_and_answered(
     assert reply_of(asked(listener, "ortholoc/hawk/command/pause"))[1].accepted, "needs no payload"
 
 
+def test_a_polygon_of_most_corners_with_all_digits_is_taken(bus: Bus, listener: Any, flight: Flight) -> None:
+    flight.commands.clear()
+    ring = tuple((-47.123456789012345 - 1e-5 * i, -117.12345678901234 - 1e-5 * i) for i in range(100))
+    found = asked(listener, "ortholoc/hawk/command/search", json.dumps({"polygon": ring}, indent=4).encode())
+    assert reply_of(found) == (True, CommandReply(command="search", accepted=True))
+    assert flight.commands == [SearchFor(polygon=ring)]
+    asked(listener, "ortholoc/hawk/command/search")
+    assert flight.commands[1:] == [SearchFor(polygon=None)]
+
+
 def test_what_takes_long_is_done_away_from_the_frame_path(bus: Bus, listener: Any, flight: Flight) -> None:
     done_by: list[str] = []
 
@@ -350,7 +361,7 @@ HOSTILE: dict[str, tuple[str, bytes, str | None, str]] = {
     "garbage as MessagePack": ("set_prior", b"\xc1\xff\x00garbage", MSGPACK, "payload is no SetPrior"),
     "no UTF-8": ("relocalize", b'{"vehicle": "\xff\xfe"}', None, "payload is no Relocalize"),
     "empty": ("set_prior", b"", None, "required field `lat_deg`"),
-    "huge": ("set_prior", b" " * 200_000, None, "200000 bytes, 4096 are allowed"),
+    "huge": ("set_prior", b" " * 200_000, None, "200000 bytes, 16384 are allowed"),
     "deep": ("pause", b"[" * 4000, None, "payload is no Pause"),
     "NaN in JSON": ("set_prior", json.dumps({**PRIOR, "lat_deg": float("nan")}).encode(), None, "no SetPrior"),
     "NaN": ("set_prior", msgspec.msgpack.encode({**PRIOR, "lat_deg": float("nan")}), MSGPACK, "`float` >= -90.0"),
@@ -364,6 +375,13 @@ HOSTILE: dict[str, tuple[str, bytes, str | None, str]] = {
     "unknown field": ("relocalize", b'{"speed": 3}', None, "unknown field `speed`"),
     "another encoding": ("pause", b"{}", "application/xml", "'application/xml' is not understood"),
     "another vehicle": ("pause", b'{"vehicle": "dove"}', None, "meant for 'dove', this is 'hawk'"),
+    "two corners": ("search", b'{"polygon": [[47, 8], [47, 8.1]]}', None, "length >= 3.*polygon"),
+    "101 corners": ("search", json.dumps({"polygon": [[47, 8]] * 101}).encode(), None, "length <= 100.*polygon"),
+    "NaN in a corner": (
+        "search", msgspec.msgpack.encode({"polygon": [(47.0, 8.0), (float("nan"), 8.1), (47.1, 8.1)]}), MSGPACK,
+        "`float` >= -90.0",
+    ),
+    "a corner of three": ("search", b'{"polygon": [[47, 8, 500], [47, 8.1, 500], [47.1, 8.1, 500]]}', None, "length 2"),
     "no command": ("explode", b"{}", None, "'explode' is no command"),
 }  # fmt: skip
 
@@ -493,6 +511,10 @@ def test_messages_are_as_the_schema_says() -> None:
     check(schema["x-published"]["fix"], json.loads(msgspec.json.encode(a_message())))
     check(schema["x-commands"]["command/set_prior"]["request"], PRIOR)
     check(schema["x-commands"]["command/set_prior"]["reply"], {"command": "set_prior", "accepted": True})
+    check(schema["x-commands"]["command/search"]["request"], {"polygon": [[47, 8], [47, 8.1], [47.1, 8.1]]})
+    check(schema["x-commands"]["command/search"]["request"], {})
+    with pytest.raises(jsonschema.ValidationError):
+        check(schema["x-commands"]["command/search"]["request"], {"polygon": [[47, 8], [47, 8.1], [97.1, 8.1]]})
     with pytest.raises(jsonschema.ValidationError):
         check(schema["x-commands"]["command/set_prior"]["request"], {**PRIOR, "lat_deg": 91})
     with pytest.raises(jsonschema.ValidationError):

@@ -25,7 +25,7 @@ from ortholoc_edge.bench.flight_log import read_frames
 from ortholoc_edge.cli import main
 from ortholoc_edge.config import Config, without_secrets
 from ortholoc_edge.daemon import Daemon
-from ortholoc_edge.pipeline.finder import SearchOptions
+from ortholoc_edge.geometry.arrays import FloatArray
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.record import FrameRecord
 from ortholoc_edge.pipeline.tracker import GivenPosition, StartAnew
@@ -33,6 +33,15 @@ from ortholoc_edge.reload import plan_reload
 
 # North of where it is, which the gate can't take for a wrong height.
 ASTRAY_M = 60.0
+
+
+# Of a degree: 110 m, and less eastward.
+MILLI = 0.001
+
+
+def ring(*corners: tuple[float, float]) -> list[list[float]]:
+    """Around where it is, corners north and east of it in thousandths of a degree."""
+    return [[PLACE.lat_deg + MILLI * north, PLACE.lon_deg + MILLI * east] for north, east in corners]
 
 
 def prior(**changes: Any) -> dict[str, Any]:
@@ -54,6 +63,7 @@ class Flown:
     texts: list[str]
     stats: dict[str, Any]
     config: dict[str, Any]
+    searched: list[FloatArray | None]
 
 
 @pytest.fixture(scope="module")
@@ -72,10 +82,11 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
             f"udpout:127.0.0.1:{autopilot.wire.port}",
             bus=BusOptions(enabled=True, vehicle="hawk", listen=(endpoint,), commands=True, image_rate_hz=10.0),
             log=LogOptions(folder=str(folder / "log"), frames="all"),
-            search=SearchOptions(agreements=10),
         ),
         on_outcome=lambda _, outcome: outcomes.append(outcome),
     )
+    searched: list[FloatArray | None] = []
+    daemon._commander._search_in = lambda corners_map, now_ns: searched.append(corners_map)
     session = listening(endpoint)
     replies: dict[str, CommandReply] = {}
     states: dict[str, dict[str, Any]] = {}
@@ -103,16 +114,16 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
             command("set_prior", "outside", **prior(lat_deg=PLACE.lat_deg + 1.0))
             command("set_prior", "buried", **prior(height_amsl_m=-400.0))
             command("set_prior", "wide", **prior(sigma_horizontal_m=400.0))
-            # Where it is not, so that it is not found before it is called back.
-            triangle = [(-0.001, 0.0012), (0.001, 0.0012), (0.0, 0.002)]
-            corners = [[PLACE.lat_deg + y, PLACE.lon_deg + x] for x, y in triangle]
-            command("search", "in a triangle", polygon=corners)
-            wait_for(lambda: latest("stats")["statistics"].get("searches"), "a search")
-            square = [(0.0, 0.0), (0.001, 0.001), (0.001, 0.0), (0.0, 0.001)]
-            command("search", "crossed", polygon=[[PLACE.lat_deg + y, PLACE.lon_deg + x] for x, y in square])
-            command("search", "far away", polygon=[[lat + 2.0, lon] for lat, lon in corners])
-            command("search", "a line", polygon=[*corners[:2], corners[0]])
-            command("search")
+            command("search", "search here", polygon=ring((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)))
+            command("search", "search everywhere")
+            command("search", "bow-tie", polygon=ring((-1, -1), (1, 1), (1, -1), (-1, 1)))
+            command("search", "line", polygon=ring((0, 0), (1e-6, 0), (1e-6, 1e-6)))
+            command("search", "point", polygon=ring((0, 0), (0, 0), (0, 0)))
+            command("search", "elsewhere", polygon=ring((500, 0), (501, 0), (501, 1)))
+            command("search", "swapped", polygon=[corner[::-1] for corner in ring((-1, -1), (1, -1), (1, 1))])
+            command("search", "pole", polygon=[[90, 0], [90, 120], [90, -120]])
+            daemon._commander._search_in = None
+            command("search", "switched off")
             command("relocalize")
             ended_with(is_fix, 3, "fixes again")
             command("pause")
@@ -142,7 +153,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     finally:
         session.close()
         autopilot.close()
-    return Flown(folder / "log", outcomes, replies, states, texts, stats, seen_config)
+    return Flown(folder / "log", outcomes, replies, states, texts, stats, seen_config, searched)
 
 
 @pytest.fixture(scope="module")
@@ -152,14 +163,18 @@ def records(flown: Flown) -> list[FrameRecord]:
 
 def test_commands_are_answered(flown: Flown) -> None:
     accepted = {name for name, reply in flown.replies.items() if reply.accepted}
-    assert accepted == {"astray", "in a triangle", "search", "relocalize", "pause", "resume", "snapshot"}
+    assert accepted == {"astray", "search here", "search everywhere", "relocalize", "pause", "resume", "snapshot"}
     for name, words in {
         "outside": "m outside of the pack",
         "buried": "below the ground there",
         "wide": "400, up to 150 m is searched",
-        "crossed": "sides 1 and 3 cross",
-        "far away": "outside of the pack",
-        "a line": "has an area of 0 m2",
+        "bow-tie": "cross or touch",
+        "line": "no area",
+        "point": "0 different corners",
+        "elsewhere": "outside of the pack",
+        "swapped": "km beyond the pack",
+        "pole": "beyond the pack",
+        "switched off": "does not search the map",
         "pause again": "paused already",
     }.items():
         assert words in flown.replies[name].reason
@@ -169,8 +184,7 @@ def test_commands_are_answered(flown: Flown) -> None:
     }
     assert flown.states["paused"]["paused"] is True and flown.states["last"]["paused"] is False
     assert flown.states["last"]["status"] == "track"
-    assert flown.stats["commands"] == 14 and flown.stats["commands_refused"] == 7
-    assert flown.stats["searches"] >= 1
+    assert flown.stats["commands"] == 18 and flown.stats["commands_refused"] == 11
 
 
 def test_a_given_position_is_where_the_next_frame_is_searched(records: list[FrameRecord]) -> None:
@@ -186,6 +200,16 @@ def test_a_given_position_is_where_the_next_frame_is_searched(records: list[Fram
     assert np.linalg.norm(np.subtract(records[back].outcome["position_map_m"], TRUTH.translation)) < 2.0
     # The autopilot must hear of it as a new start.
     assert records[back + 1].reset_counter == (records[number].reset_counter + 1) % 256
+
+
+def test_a_polygon_is_searched_where_it_lies_on_the_map(flown: Flown) -> None:
+    here, everywhere = flown.searched
+    assert everywhere is None
+    assert here is not None and here.shape == (4, 2)
+    assert np.linalg.norm(here.mean(axis=0) - TRUTH.translation[:2]) < 1.0
+    corner = here[np.argmax(here.sum(axis=1))] - TRUTH.translation[:2]
+    assert corner[1] == pytest.approx(111.2, rel=0.05), "a thousandth of a degree to the north"
+    assert corner[0] == pytest.approx(111.2 * np.cos(np.radians(PLACE.lat_deg)), rel=0.05)
 
 
 def test_a_replay_takes_the_commands_in_too(flown: Flown, capsys: pytest.CaptureFixture[str]) -> None:
@@ -218,7 +242,7 @@ def test_commands_are_in_the_log_for_people(flown: Flown) -> None:
             found += [json.loads(m.data) for _, _, m in make_reader(file).iter_messages(topics=["/ortholoc/command"])]
     assert [(one["reply"]["command"], one["reply"]["accepted"]) for one in found] == [
         ("set_prior", True), ("set_prior", False), ("set_prior", False), ("set_prior", False), ("search", True),
-        ("search", False), ("search", False), ("search", False), ("search", True), ("relocalize", True),
+        ("search", True), *[("search", False)] * 7, ("relocalize", True),
         ("pause", True), ("pause", False), ("resume", True), ("snapshot", True),
     ]  # fmt: skip
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Iterator
+from concurrent.futures import Future
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,8 @@ from chromium import Chromium, Tab, chromium, find
 from ortholoc_sim import demo_pack_path
 
 from ortholoc_edge.adapters.computer import ComputerStatus
-from ortholoc_edge.adapters.messages import AutopilotMessage
-from ortholoc_edge.adapters.page.ground_page import GroundPage, Health
+from ortholoc_edge.adapters.messages import AutopilotMessage, CommandReply, SearchFor
+from ortholoc_edge.adapters.page.ground_page import GroundPage, Health, LeaveCommand
 from ortholoc_edge.adapters.page.options import Listen
 from ortholoc_edge.adapters.page.report import FlightRecord
 from ortholoc_edge.clock import SystemClock
@@ -34,10 +35,10 @@ HOSTILE = "</script><img src=x onerror=document.title='owned'>"
 class Feeder:
     """Leaves for the page what a daemon would."""
 
-    def __init__(self, store: MapStore, listen: Listen) -> None:
+    def __init__(self, store: MapStore, listen: Listen, leave: LeaveCommand | None = None) -> None:
         self.clock = SystemClock()
         self.page = GroundPage(
-            listen, self.clock, store, CAMERA, NADIR, {"matcher": "structural", "vehicle": "hawk"}
+            listen, self.clock, store, CAMERA, NADIR, {"matcher": "structural", "vehicle": "hawk"}, leave
         )
         west, south, east, north = store.bounds
         self.middle = np.array([(west + east) / 2, (south + north) / 2, 400.0])
@@ -229,6 +230,65 @@ def test_zoom_and_pan(browser: Chromium, flying: Feeder) -> None:
     assert tab.run("map.centre") != west_south
     tab.run("byId('follow').click()")
     tab.wait_for("Math.hypot(...map.centre.map((v, k) => v - map.layers.pose.at[k])) < 0.01", "back at the vehicle")
+
+
+def test_an_area_is_drawn_with_a_finger_and_sent(browser: Chromium, store: MapStore) -> None:
+    commands: list[SearchFor] = []
+    replies = [
+        CommandReply(command="search", accepted=True),
+        CommandReply(command="search", accepted=False, reason=HOSTILE, remedy="draw it anew"),
+    ]
+
+    def leave(command: SearchFor) -> Future[CommandReply]:
+        commands.append(command)
+        future: Future[CommandReply] = Future()
+        future.set_result(replies[len(commands) - 1])
+        return future
+
+    # Its own: cookies are of all ports of the host, and the browser is shared.
+    token = b"drawn-0123456789abcdef"
+    feeder = Feeder(store, Listen("127.0.0.1", free_port(), False, token, frozenset()), leave)
+    try:
+        wait(lambda: feeder.page.address is not None)
+        feeder.fix(0.0, 0.0)
+        tab = browser.tab(360, 640, mobile=True)
+        tab.goto(f"{feeder.page.address}/?token={token.decode()}")
+        tab.wait_for("map !== null && map.layers.pose !== null && zoomed", "a map")
+        assert tab.run("document.documentElement.scrollWidth") <= 360, "nothing sticks out"
+        tab.run("byId('draw').click(); map.centre = [0, 0]; map.scale = 4; map.draw()")
+        west, north = tab.run("[...'xy'].map((k) => byId('map').getBoundingClientRect()[k])")
+        wanted = [(-20.0, -15.0), (10.0, -15.0), (10.0, 12.0)]
+        for corner, (east_m, north_m) in enumerate(wanted):
+            assert tab.run("byId('send').hidden")
+            x, y = tab.run(f"map.toScreen({east_m}, {north_m})")
+            point = {"x": west + x, "y": north + y}
+            tab.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=[point])
+            tab.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+            tab.wait_for(f"map.layers.area.length === {corner + 1}", "a corner")
+        assert not tab.run("map.follows")
+        tab.run("byId('send').click()")
+        tab.wait_for("byId('search-note').textContent === 'accepted: searching in the area'", "an answer")
+        assert tab.run("map.layers.area.length === 0 && map.onTap === null && byId('send').hidden")
+        box = store.bounds
+        origin = round((box[0] + box[2]) / 2), round((box[1] + box[3]) / 2)
+        found = store.pack.georeference.map_from_lat_lon(commands[0].polygon) - origin
+        assert np.abs(found - wanted).max() < 0.3, "a finger is put down on whole pixels"
+        time.sleep(1.1)
+        tab.run("byId('everywhere').click()")
+        tab.wait_for("byId('search-note').textContent.includes('draw it anew')", "why not")
+        assert HOSTILE in tab.text("#search-note") and tab.run("document.title") == "OrthoLoC", "text stays text"
+        assert commands[1].polygon is None
+        assert tab.console == []
+    finally:
+        feeder.page.close()
+
+
+def test_without_commands_there_is_no_button_for_them(browser: Chromium, flying: Feeder) -> None:
+    flying.fix(0.0, 0.0)
+    tab = browser.tab(360, 640, mobile=True)
+    tab.goto(f"{flying.page.address}/")
+    tab.wait_for("map !== null", "a map")
+    assert tab.run("byId('draw').hidden && byId('everywhere').hidden && byId('send').hidden")
 
 
 def test_what_is_old_is_never_shown_as_fresh(browser: Chromium, flying: Feeder) -> None:

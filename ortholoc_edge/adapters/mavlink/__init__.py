@@ -8,11 +8,12 @@ does both.
 from ortholoc_edge.adapters.mavlink.codec import MavlinkMessage
 from ortholoc_edge.adapters.mavlink.gimbal import GimbalSelection
 from ortholoc_edge.adapters.mavlink.link import AutopilotLink
+from ortholoc_edge.adapters.mavlink.operator import GivenPlace
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus
 from ortholoc_edge.adapters.mavlink.protocol import Statistic
 from ortholoc_edge.adapters.mavlink.state import AutopilotIdentity, AutopilotState, GnssPosition
 
 __all__ = [
-    "AutopilotIdentity", "AutopilotLink", "AutopilotState", "GimbalSelection", "GnssPosition", "LinkOptions",
-    "MavlinkMessage", "Severity", "Statistic", "SystemStatus",
+    "AutopilotIdentity", "AutopilotLink", "AutopilotState", "GimbalSelection", "GivenPlace", "GnssPosition",
+    "LinkOptions", "MavlinkMessage", "Severity", "Statistic", "SystemStatus",
 ]  # fmt: skip

@@ -24,6 +24,7 @@ from ortholoc_edge.adapters.mavlink.gimbal import GimbalSelection
 from ortholoc_edge.adapters.mavlink.latency import Ages, DelayAdvice
 from ortholoc_edge.adapters.mavlink.log import LimitedLog
 from ortholoc_edge.adapters.mavlink.monitor import FusionReport
+from ortholoc_edge.adapters.mavlink.operator import LeavePlace
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus, parse_endpoint
 from ortholoc_edge.adapters.mavlink.parameters import Number, Reading, Written
 from ortholoc_edge.adapters.mavlink.protocol import LinkProtocol, Statistic
@@ -299,6 +300,15 @@ class AutopilotLink:
         """Of a :meth:`take_source_set` that came to its end since the last call, if one did."""
         with self._lock:
             return self._protocol.source_set.take_outcome()
+
+    def take_places(self, leave: LeavePlace) -> None:
+        """From now on, hand over where people say the vehicle is, if ``options.accept_positions`` allows it.
+
+        Args:
+            leave: called in the link's thread, must return at once.
+        """
+        with self._lock:
+            self._protocol.operator.leave = leave
 
     def send_status_text(self, severity: Severity, text: str) -> None:
         """Show a line at the ground station. Cut at 200 characters; of more than 16 waiting parts the oldest

@@ -66,6 +66,8 @@ class LinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
             checks nothing.
         signing_link_id: the link's number in our signatures.
         signing_state: the file where signing's stamps are kept across restarts; None takes systemd's state folder.
+        accept_positions: whether a MAV_CMD_EXTERNAL_POSITION_ESTIMATE addressed to us steers the search, as `set_prior`
+            on the bus. Without signing whoever reaches the link may send it.
         require_signed: refuse what is not signed, but for RADIO_STATUS. What is signed by another key is refused
             anyway.
     """
@@ -96,6 +98,7 @@ class LinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     signing_link_id: Annotated[int, msgspec.Meta(ge=0, le=255)] = 0
     signing_state: Annotated[str, msgspec.Meta(min_length=1)] | None = None
     require_signed: bool = False
+    accept_positions: bool = False
 
     @property
     def way_of_release(self) -> Literal["fast-forward", "fixed-latency", "raw"]:

@@ -16,6 +16,7 @@ from ortholoc_edge.adapters.mavlink.gimbal import GimbalSelection
 from ortholoc_edge.adapters.mavlink.latency import Ages, DelayAdvice, LatencyMeter, advise, ages_of
 from ortholoc_edge.adapters.mavlink.log import LimitedLog
 from ortholoc_edge.adapters.mavlink.monitor import FusionMonitor
+from ortholoc_edge.adapters.mavlink.operator import OperatorDesk
 from ortholoc_edge.adapters.mavlink.options import LinkOptions, Severity, SystemStatus, parse_endpoint
 from ortholoc_edge.adapters.mavlink.outlet import Outlet
 from ortholoc_edge.adapters.mavlink.parameters import ParameterClient
@@ -90,6 +91,7 @@ class LinkProtocol:
         self.latency = LatencyMeter()
         self.monitor = FusionMonitor()
         self.source_set = PendingSwitch()
+        self.operator = OperatorDesk(self.counts)
         self._texts_told: OrderedDict[str, int] = OrderedDict()
         self._advice: DelayAdvice | None = None
         self.parameters = ParameterClient()
@@ -190,6 +192,10 @@ class LinkProtocol:
         if name == "HEARTBEAT" and component == _AUTOPILOT_COMPONENT:
             self._on_heartbeat(message, system, arrival_ns)
             return
+        if self._is_position_for_us(message):
+            self.counts[f"received.{name}"] += 1
+            self.operator.take(message, arrival_ns)
+            return
         if self._vehicle is None or (system, component) != (self._vehicle.system_id, _AUTOPILOT_COMPONENT):
             ours = self._vehicle is not None and system == self._vehicle.system_id
             taken = ours and self.telemetry.take_of_component(message, arrival_ns)
@@ -209,6 +215,17 @@ class LinkProtocol:
         handler = self._handlers.get(name)
         if handler is not None:
             handler(message, arrival_ns)
+
+    def _is_position_for_us(self, message: MavlinkMessage) -> bool:
+        """From anybody: an autopilot hands on what a ground station addresses to us. Not what is for all."""
+        return (
+            self._options.accept_positions
+            and self._vehicle is not None
+            and message.get_type() in ("COMMAND_INT", "COMMAND_LONG")
+            and message.command == dialect.MAV_CMD_EXTERNAL_POSITION_ESTIMATE
+            and message.target_system == self.own_system_id
+            and message.target_component == self._options.component_id
+        )
 
     def is_vehicle_heartbeat(self, message: MavlinkMessage) -> bool:
         """Whether this is the heartbeat of an autopilot that we may serve, not of a ground station or a
@@ -386,6 +403,7 @@ class LinkProtocol:
         vehicle = self._vehicle
         if vehicle is None:
             return out
+        out += self.operator.poll(now_ns)
         if now_ns - self._heartbeat_ns > _SILENT_AFTER_NS:
             if not self._silent:
                 self._silent = True

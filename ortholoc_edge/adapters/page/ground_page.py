@@ -11,26 +11,29 @@ import re
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import msgspec
 import numpy as np
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from ortholoc_edge import __version__
+from ortholoc_edge.adapters.commands import Answer
 from ortholoc_edge.adapters.computer import ComputerStatus
-from ortholoc_edge.adapters.messages import AutopilotMessage
+from ortholoc_edge.adapters.messages import AutopilotMessage, Command, CommandReply, SearchFor
 from ortholoc_edge.adapters.page.board import Board
 from ortholoc_edge.adapters.page.http import RefusedError, Request, response
 from ortholoc_edge.adapters.page.marks import Drawing, ground_of
 from ortholoc_edge.adapters.page.options import Listen
 from ortholoc_edge.adapters.page.orthophoto import TILE_PX, Orthophoto, jpeg
-from ortholoc_edge.adapters.page.server import PageServer
+from ortholoc_edge.adapters.page.server import Later, PageServer
 from ortholoc_edge.clock import Clock
+from ortholoc_edge.errors import MapError
 from ortholoc_edge.geometry.arrays import ImageArray
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.rigid import Rigid3
@@ -51,6 +54,9 @@ _PICTURE_PX, _PICTURE_QUALITY = 480, 65
 _BIND_AGAIN_S = 5.0
 _CLOSE_WAIT_S = 3.0
 _DAY_S = 86400
+# As for commands from the bus; and how far commands are apart at least.
+_COMMAND_WAIT_S, _COMMAND_PAUSE_S = 5.0, 1.0
+_SEARCH = "/command/search"
 _STATIC = {
     "/": ("index.html", "text/html; charset=utf-8"),
     "/page.css": ("page.css", "text/css; charset=utf-8"),
@@ -60,6 +66,16 @@ _STATIC = {
 }
 _TILE = re.compile(r"/tiles/(\d{1,2})/(\d{1,5})/(\d{1,5})\.jpg", re.ASCII)
 _PICTURE = re.compile(r"/frame/(\d{1,12})\.jpg", re.ASCII)
+
+
+# Leaves a command for the frame path: what it comes to. None: too much waits there already.
+LeaveCommand = Callable[[Command], "Future[Answer] | None"]
+
+
+class SearchHere(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What the page posts: corners of a polygon, metres east and north of the scene's origin; None: everywhere."""
+
+    corners: Annotated[tuple[tuple[float, float], ...], Meta(min_length=3, max_length=100)] | None = None
 
 
 class Health(Struct, frozen=True, kw_only=True):
@@ -122,23 +138,29 @@ class GroundPage:
         camera: Camera,
         body_from_camera: Rigid3 | None,
         about: Mapping[str, Any],
+        leave: LeaveCommand | None = None,
     ) -> None:
         """
         Args:
             clock: the one of frames' stamps.
             camera, body_from_camera: as configured; None: in a gimbal.
             about: more for the page's head: ``matcher``, ``vehicle``.
+            leave: called in the page's thread, must return at once; None: the page takes no commands.
         """
         self._listen, self._clock = listen, clock
         west, south, east, north = store.bounds
         origin = float(round((west + east) / 2)), float(round((south + north) / 2))
         self._drawing = Drawing(origin, camera, body_from_camera)
         self._photo = Orthophoto(store)
+        self._leave = leave
+        self._commanded_s: float | None = None
         # Numbers begin anew with each life of the daemon, and after a restart of the computer the clock does, too.
         self._session = f"{self._clock.now_ns():x}-{time.time_ns() // _MS:x}"
         manifest, georeference = store.pack.manifest, store.pack.georeference
         version = (store.pack.manifest_sha256 or "")[:12]
+        self._origin, self._georeference = origin, georeference
         self._scene = {
+            "commands": leave is not None,
             "session": self._session,
             "version": __version__,
             "pack": {"name": store.pack.path.name, "date": manifest.dop.date, "attribution": manifest.dop.attribution},
@@ -206,7 +228,9 @@ class GroundPage:
         failures = 0
         while not self._stop.is_set():
             try:
-                self._server = PageServer(self._listen, self._answer)
+                self._server = PageServer(
+                    self._listen, self._answer, frozenset() if self._leave is None else frozenset({_SEARCH})
+                )
                 logger.info("ground page: %s%s", self.address, "" if self._listen.token is None else " (with token)")
                 failures = 0
                 self._serve(self._server)
@@ -297,10 +321,48 @@ class GroundPage:
         self._pictures.append(_Picture(number, jpeg(small, _PICTURE_QUALITY), event))
         return True
 
-    def _answer(self, request: Request) -> bytes | None:
+    def _command(self, request: Request) -> bytes | Later:
+        """Raises: RefusedError."""
+        now_s = time.monotonic()
+        if self._commanded_s is not None and now_s - self._commanded_s < _COMMAND_PAUSE_S:
+            raise RefusedError(503, "another command was sent a moment ago; send it again")
+        self._commanded_s = now_s
+        try:
+            asked = msgspec.json.decode(request.body, type=SearchHere)
+            polygon = None if asked.corners is None else tuple(self._lat_lon(*corner) for corner in asked.corners)
+            command = msgspec.convert({"polygon": polygon}, SearchFor)
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, MapError) as error:
+            return _told(False, str(error), "draw a polygon on the map")
+        taken = None if self._leave is None else self._leave(command)
+        if taken is None:
+            return _told(False, "the frame path is busy", "send it again")
+        waiting = taken
+
+        def later() -> bytes | None:
+            if waiting.done():
+                if waiting.exception() is not None:
+                    logger.error("a command of the page", exc_info=waiting.exception())
+                    return _told(False, "it failed", "see the daemon's messages")
+                reply = waiting.result()
+                assert isinstance(reply, CommandReply)
+                return _told(reply.accepted, reply.reason, reply.remedy)
+            if time.monotonic() - now_s > _COMMAND_WAIT_S and waiting.cancel():
+                return _told(False, "the frame path did not come to it", "send it again")
+            return None
+
+        return later
+
+    def _lat_lon(self, east_m: float, north_m: float) -> tuple[float, float]:
+        """Raises: MapError."""
+        place = self._georeference.geodetic_from_map((self._origin[0] + east_m, self._origin[1] + north_m, 0.0))
+        return place.lat_deg, place.lon_deg
+
+    def _answer(self, request: Request) -> bytes | Later | None:
         """See `PageServer`. Raises: RefusedError."""
         head_only = request.method == "HEAD"
         path = request.path
+        if request.method == "POST":
+            return self._command(request)
         if path == "/events":
             if head_only:
                 raise RefusedError(405, "events are read with GET")
@@ -321,6 +383,11 @@ class GroundPage:
                 if picture.number == int(asked[1]):
                     return response(200, picture.data, "image/jpeg", head_only=head_only)
         raise RefusedError(404, "there is no such thing here")
+
+
+def _told(accepted: bool, reason: str, remedy: str) -> bytes:
+    reply = CommandReply(command="search", accepted=accepted, reason=reason, remedy=remedy)
+    return response(200, msgspec.json.encode(reply), "application/json")
 
 
 def thumbnail(image: ImageArray) -> tuple[ImageArray, float] | None:

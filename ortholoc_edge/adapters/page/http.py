@@ -1,7 +1,8 @@
-"""As much of HTTP/1.1 as the page needs: GET and HEAD without a body, one request per connection; bytes in, bytes out.
+"""As much of HTTP/1.1 as the page needs: GET and HEAD without a body, POST of JSON to what takes
+commands, one request per connection; bytes in, bytes out.
 
 Own, and not the library's: `http.server` takes a thread for each connection, and asyncio loads TLS. What is not
-understood is refused, so that there is little to get wrong: no bodies, no chunks, no second request that a first could
+understood is refused, so that there is little to get wrong: no chunks, no second request that a first could
 smuggle in.
 """
 
@@ -15,7 +16,7 @@ from dataclasses import dataclass
 from ipaddress import ip_address
 from urllib.parse import parse_qs
 
-MAX_HEAD_BYTES = 8192
+MAX_HEAD_BYTES, MAX_BODY_BYTES = 8192, 8192
 _MAX_HEADERS = 64
 _REQUEST_LINE = re.compile(rb"([A-Z]{1,16}) (/[\x21-\x7e]{0,1023}) HTTP/1\.[01]")
 # One quantifier after the colon and no more: beside it others for blanks took minutes over 8 KiB of them.
@@ -24,7 +25,8 @@ _HOST = re.compile(r"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9.-]+)(:\d{1,5})?", re.ASCII)
 _STATUS = {
     200: "OK", 303: "See Other", 400: "Bad Request", 401: "Unauthorized", 403: "Forbidden", 404: "Not Found",
     405: "Method Not Allowed", 408: "Request Timeout", 413: "Content Too Large",
-    431: "Request Header Fields Too Large", 500: "Internal Server Error", 503: "Service Unavailable",
+    415: "Unsupported Media Type", 431: "Request Header Fields Too Large", 500: "Internal Server Error",
+    503: "Service Unavailable",
 }  # fmt: skip
 # Only what we serve ourselves is loaded, shown, or framed; and nothing of ours by other sites.
 _SECURITY = (
@@ -55,16 +57,23 @@ class RefusedError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What was asked for; ``headers`` by lower-case name."""
+    """What was asked for; ``headers`` by lower-case name, ``body_bytes`` as announced."""
 
     method: str
     path: str
     query: str
     headers: Mapping[str, str]
+    body_bytes: int = 0
+    body: bytes = b""
 
 
-def parse_request(head: bytes) -> Request:
-    """A request's head, up to the empty line that ends it. Raises: RefusedError."""
+def parse_request(head: bytes, posts: frozenset[str] = frozenset()) -> Request:
+    """A request's head, up to the empty line that ends it.
+
+    Args:
+        posts: paths that take a body.
+    Raises: RefusedError.
+    """
     line, *rest = head.split(b"\r\n")
     match = _REQUEST_LINE.fullmatch(line)
     if match is None:
@@ -80,12 +89,32 @@ def parse_request(head: bytes) -> Request:
         if name in headers and name in ("host", "origin", "content-length", "transfer-encoding", "cookie"):
             raise RefusedError(400, f"{name} twice")
         headers[name] = header[2].strip(b" \t").decode("latin-1")
+    path, _, query = match[2].decode("ascii").partition("?")
+    if match[1] == b"POST" and path in posts:
+        return Request("POST", path, query, headers, _posted_bytes(headers))
     if match[1] not in (b"GET", b"HEAD"):
         raise RefusedError(405, "the page is only read")
+    if path in posts:
+        raise RefusedError(405, "commands are sent with POST")
     if headers.get("content-length", "0") != "0" or "transfer-encoding" in headers:
-        raise RefusedError(413, "the page takes no bodies")
-    path, _, query = match[2].decode("ascii").partition("?")
+        raise RefusedError(413, "no body is taken here")
     return Request(match[1].decode("ascii"), path, query, headers)
+
+
+def _posted_bytes(headers: Mapping[str, str]) -> int:
+    """Raises: RefusedError."""
+    # A form of another site can send neither this type nor, from a script, without asking first.
+    if headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
+        raise RefusedError(415, "commands are JSON")
+    # Who posts says where from: a browser does.
+    if "origin" not in headers:
+        raise RefusedError(403, "a command without an origin")
+    length = headers.get("content-length", "")
+    if "transfer-encoding" in headers or not re.fullmatch(r"\d{1,5}", length, re.ASCII):
+        raise RefusedError(400, "a body without a length")
+    if int(length) > MAX_BODY_BYTES:
+        raise RefusedError(413, f"a body of more than {MAX_BODY_BYTES} bytes")
+    return int(length)
 
 
 def response(
@@ -146,7 +175,7 @@ class Guard:
             return None
         if request.path == "/" and "token" in (asked := parse_qs(request.query)):
             if hmac.compare_digest(asked["token"][0].encode("utf-8"), self._token):
-                # Lax: the redirect after a link in a message must carry it; all that can be asked is read, not done.
+                # Lax: the redirect after a link in a message must carry it; a command of another site gets none.
                 cookie = f"{_COOKIE}={self._cookie}; Path=/; HttpOnly; SameSite=Lax; Max-Age=86400"
                 return response(303, extra=f"Location: /\r\nSet-Cookie: {cookie}\r\n")
             return self._ask(request)

@@ -29,12 +29,14 @@ class PageOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
             written into flight logs.
         hosts: names, besides IP addresses and localhost, under which browsers may ask for the page. Others are
             refused: a website could point its own name at the drone and read the page through a visitor's browser.
+        commands: whether the page may start and narrow the search; only with ``token_file``.
     """
 
     enabled: bool = False
     listen: str = "127.0.0.1:8080"
     token_file: Annotated[str, Meta(min_length=1)] | None = None
     hosts: tuple[Annotated[str, Meta(pattern=_HOST)], ...] = ()
+    commands: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +68,8 @@ def refused(options: PageOptions) -> str | None:
             f"{options.listen} can be reached from other computers, and there is no token_file, so anyone there could "
             "watch the flight; write 127.0.0.1, or name a file with a token"
         )
+    if options.commands and options.token_file is None:
+        return "commands = true without token_file, so any program there could send them; name a file with a token"
     return None
 
 

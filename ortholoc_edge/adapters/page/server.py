@@ -14,7 +14,7 @@ import socket
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from ortholoc_edge.adapters.page.http import (
     MAX_HEAD_BYTES,
@@ -40,8 +40,10 @@ _SEND_BUFFER_BYTES = 131_072
 # What a client that has gone away still sends is read for so long, or the answer would be lost with a reset.
 _LINGER_S = 1.0
 
-# What a request gets; "stream" asks for the events.
-Answer = Callable[[Request], "bytes | None"]
+# An answer that is not there yet: None until it is.
+Later = Callable[[], "bytes | None"]
+# What a request gets; None for who asked for the events.
+Answer = Callable[[Request], "bytes | Later | None"]
 
 
 @dataclass(slots=True, eq=False)
@@ -52,7 +54,8 @@ class _Client:
         head: of the request, as far as it came. out: what is still to be sent.
         until_s: when it is given up, on `time.monotonic`.
         streams: whether it gets events; seen: the last outcome that it was sent, and picture.
-        answered: whether the answer is in ``out`` or sent; done: whether it was sent.
+        later: gives the answer, where it is not there yet.
+        answered: whether the answer is in ``out`` or sent, or comes later; done: whether it was sent.
     """
 
     sock: socket.socket
@@ -61,6 +64,7 @@ class _Client:
     head: bytearray = field(default_factory=bytearray)
     out: memoryview = field(default_factory=lambda: memoryview(b""))
     streams: bool = False
+    later: Later | None = None
     answered: bool = False
     done: bool = False
     seen: int = -1
@@ -74,13 +78,14 @@ class PageServer:
         counts: ``requests``, ``refused``, ``dropped`` clients, ``missed`` events.
     """
 
-    def __init__(self, listen: Listen, answer: Answer) -> None:
+    def __init__(self, listen: Listen, answer: Answer, posts: frozenset[str] = frozenset()) -> None:
         """
         Args:
+            posts: paths that take a body.
             answer: to a request that the guard let through; None where the events are asked for.
         Raises: OSError if the address can't be had.
         """
-        self._answer, self._guard = answer, Guard(listen.token, listen.hosts)
+        self._answer, self._guard, self._posts = answer, Guard(listen.token, listen.hosts), posts
         self.counts: Counter[str] = Counter()
         self._clients: dict[socket.socket, _Client] = {}
         family = socket.AF_INET6 if listen.is_ipv6 else socket.AF_INET
@@ -122,6 +127,7 @@ class PageServer:
                 self._take()
             else:
                 self._serve(key.data)
+        self._finish_later()
         now_s = time.monotonic()
         for client in [one for one in self._clients.values() if one.until_s < now_s]:
             self.counts["dropped"] += not client.done
@@ -204,7 +210,7 @@ class PageServer:
             return
         if not data:
             # Half closed by a client that waits for its answer, or gone; sending tells.
-            if client.done or not client.answered or client.streams:
+            if client.done or not client.answered or client.streams or client.later is not None:
                 self._drop(client)
             else:
                 self._watch(client, selectors.EVENT_WRITE)
@@ -215,24 +221,50 @@ class PageServer:
         end = client.head.find(b"\r\n\r\n")
         if end < 0 and len(client.head) <= MAX_HEAD_BYTES:
             return
+        if 0 <= end <= MAX_HEAD_BYTES and len(client.head) < end + 4 + self._body_bytes(client, end):
+            return
         client.answered = True
         client.until_s = time.monotonic() + ANSWER_TIMEOUT_S
         client.out = memoryview(self._answered(client, end))
         client.head.clear()
+
+    def _body_bytes(self, client: _Client, end: int) -> int:
+        """How much is still to come after the head, of what will be looked at."""
+        try:
+            request = parse_request(bytes(client.head[:end]), self._posts)
+            return request.body_bytes if self._guard.answer(request) is None else 0
+        except RefusedError:
+            return 0
+
+    def _finish_later(self) -> None:
+        """Send what has become of commands."""
+        for client in list(self._clients.values()):
+            if client.later is None:
+                continue
+            answer = client.later()
+            if answer is not None:
+                client.later, client.out = None, memoryview(answer)
+                self._guarded(client, self._send)
 
     def _answered(self, client: _Client, end: int) -> bytes:
         self.counts["requests"] += 1
         try:
             if not 0 <= end <= MAX_HEAD_BYTES:
                 raise RefusedError(431, f"more than {MAX_HEAD_BYTES} bytes before the empty line")
-            request = parse_request(bytes(client.head[:end]))
+            request = parse_request(bytes(client.head[:end]), self._posts)
+            if request.body_bytes:
+                body = bytes(client.head[end + 4 : end + 4 + request.body_bytes])
+                request = replace(request, body=body)
             barred = self._guard.answer(request)
             if barred is not None:
                 self.counts["refused"] += barred.startswith(b"HTTP/1.1 4")
                 return barred
-            body = self._answer(request)
-            if body is not None:
-                return body
+            answer = self._answer(request)
+            if callable(answer):
+                client.later = answer
+                return b""
+            if answer is not None:
+                return answer
             if self.viewers >= MAX_STREAMS:
                 raise RefusedError(503, f"{MAX_STREAMS} pages are open already; close one")
         except RefusedError as refused:

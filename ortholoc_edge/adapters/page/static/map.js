@@ -28,12 +28,15 @@ class FlightMap {
     this.tileUrl = tileUrl;
     this.tiles = new Map();
     this.loading = 0;
-    this.layers = { track: [], truth: [], points: [], pose: null, prior: null, believed: null, gnss: null, old: null };
+    this.layers = { track: [], truth: [], points: [], pose: null, prior: null, believed: null, gnss: null, old: null, area: [] };
     this.follows = true;
     this.wasFitted = false;
     this.centre = [(scene.bounds[0] + scene.bounds[2]) / 2, (scene.bounds[1] + scene.bounds[3]) / 2];
     this.scale = 1;
     this.onView = () => {};
+    /* Told of a tap, [east, north], while it is set. */
+    this.onTap = null;
+    this.tap = null;
     this.asked = false;
     this.pointers = new Map();
     this.resize();
@@ -109,12 +112,20 @@ class FlightMap {
     };
     canvas.addEventListener("pointerdown", (event) => {
       try { canvas.setPointerCapture(event.pointerId); } catch { /* it is gone already */ }
+      this.tap = this.pointers.size ? null : at(event);
       this.pointers.set(event.pointerId, at(event));
+    });
+    canvas.addEventListener("pointerup", (event) => {
+      // A finger rolls by some pixels; more is a drag.
+      const [x, y] = at(event), tap = this.tap;
+      this.tap = null;
+      if (this.onTap && tap && Math.hypot(x - tap[0], y - tap[1]) < 10) this.onTap(this.toWorld(...tap));
     });
     canvas.addEventListener("pointermove", (event) => {
       const was = this.pointers.get(event.pointerId);
       if (!was) return;
       const now = at(event);
+      if (this.onTap && this.tap && Math.hypot(now[0] - this.tap[0], now[1] - this.tap[1]) < 10) return;
       const others = [...this.pointers].filter(([id]) => id !== event.pointerId);
       if (others.length === 0) {
         this.move(now[0] - was[0], now[1] - was[1]);
@@ -133,7 +144,7 @@ class FlightMap {
       event.preventDefault();
       this.zoom(Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0015)), ...at(event));
     }, { passive: false });
-    canvas.addEventListener("dblclick", (event) => this.zoom(2, ...at(event)));
+    canvas.addEventListener("dblclick", (event) => { if (!this.onTap) this.zoom(2, ...at(event)); });
     canvas.addEventListener("keydown", (event) => {
       const steps = { ArrowLeft: [60, 0], ArrowRight: [-60, 0], ArrowUp: [0, 60], ArrowDown: [0, -60] };
       if (event.key in steps) this.move(...steps[event.key]);
@@ -178,6 +189,10 @@ class FlightMap {
       if (!old) this.polygon(pen, pose.rim, INK.sees, []);
       this.ellipse(pen, pose, ink, [], old ? 0 : 0.28);
     }
+    const { area } = this.layers;
+    this.polygon(pen, area, INK.predicted, []);
+    if (area.length === 2) this.paintLine(pen, area, INK.predicted);
+    for (const [east, north] of area) this.disc(pen, east, north, 6, INK.point);
     if (gnss) this.ring(pen, gnss, INK.gnss);
     if (believed) this.diamond(pen, believed, INK.believed);
     if (pose) {

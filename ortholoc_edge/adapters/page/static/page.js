@@ -86,16 +86,65 @@ function setScene(scene) {
     byId("follow").onclick = () => map.setFollows(!map.follows);
     byId("whole").onclick = () => { map.setFollows(false); map.fit(known.scene.bounds); };
     fillLegend(byId("legend"));
+    offerSearch();
   } else if (JSON.stringify(map.scene) !== JSON.stringify(scene)) {
     map.scene = scene;
     map.tiles.clear();
     map.fit(scene.bounds);
     zoomed = false;
   }
+  byId("draw").hidden = byId("everywhere").hidden = !scene.commands;
   const { pack } = scene;
   byId("about").textContent =
     `OrthoLoC Edge ${scene.version} · ${scene.vehicle} · map ${pack.name}, ${pack.date || "undated"}, ${scene.crs}` +
     ` · ${pack.attribution || ""} · matcher ${scene.matcher}`;
+}
+
+/* -- the search, by whoever knows where the vehicle is -- */
+
+function searchNote(text) {
+  byId("search-note").hidden = !text;
+  setText("search-note", text);
+}
+
+function offerSearch() {
+  const draw = byId("draw"), send = byId("send");
+  const end = () => {
+    map.onTap = null;
+    map.show({ area: [] });
+    draw.textContent = "search here";
+    send.hidden = true;
+  };
+  draw.onclick = () => {
+    if (map.onTap) { end(); searchNote(""); return; }
+    map.setFollows(false);
+    draw.textContent = "cancel";
+    searchNote("tap the corners of the area where the vehicle is, in order");
+    map.onTap = (place) => {
+      if (map.layers.area.length >= 100) return;
+      map.show({ area: [...map.layers.area, place] });
+      send.hidden = map.layers.area.length < 3;
+    };
+  };
+  send.onclick = () => { const corners = map.layers.area; end(); sendSearch({ corners }); };
+  byId("everywhere").onclick = () => { end(); sendSearch({}); };
+}
+
+async function sendSearch(what) {
+  searchNote("sent, no answer yet");
+  try {
+    const answer = await fetch("/command/search", {
+      method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(what),
+      signal: AbortSignal.timeout(15000),
+    });
+    const text = await answer.text();
+    if (!answer.ok) { searchNote(`refused: ${text.slice(0, 200)}`); return; }
+    const reply = JSON.parse(text);
+    searchNote(reply.accepted ? (what.corners ? "accepted: searching in the area" : "accepted: searching everywhere")
+      : `refused: ${reply.reason}; ${reply.remedy}`);
+  } catch {
+    searchNote("no answer: it may or may not have been taken");
+  }
 }
 
 function setPicture(picture) {
