@@ -213,6 +213,9 @@ def _step_back() -> None:
     """Below everything else on this computer; where the system forbids it, it goes on as it is."""
     with contextlib.suppress(OSError):
         os.nice(_LEAST_PRIORITY)
+    with contextlib.suppress(OSError, AttributeError):
+        # Gives way at once to whatever wakes up, where the least priority alone may finish its slice.
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     with contextlib.suppress(OSError, ValueError):
         path = Path("/proc/self/oom_score_adj")
         path.write_text(str(min(int(path.read_text()) + _OOM_SCORE, 1000)))

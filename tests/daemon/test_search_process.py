@@ -79,6 +79,7 @@ def test_found_by_another_process_below_everything_else_which_may_be_killed() ->
         pid = process.pid
         assert pid is not None
         assert os.getpriority(os.PRIO_PROCESS, pid) == 19
+        assert os.sched_getscheduler(pid) == os.SCHED_IDLE
         own = int(Path("/proc/self/oom_score_adj").read_text())
         assert int(Path(f"/proc/{pid}/oom_score_adj").read_text()) == min(own + 500, 1000)
         # The same process the second time; killed in the middle of it.
