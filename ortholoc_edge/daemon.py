@@ -498,7 +498,13 @@ class Daemon:
         return outcome
 
     def _search(self, finder: Finder, localized: Localized) -> None:
-        order = finder.step(localized.frame, localized.state, localized.outcome, self._clock.now_ns())
+        try:
+            order = finder.step(localized.frame, localized.state, localized.outcome, self._clock.now_ns())
+        except Exception:  # the frame is settled; a defect of the search must not end the flight
+            self._counts["search_errors"] += 1
+            if self._counts["search_errors"] == 1:
+                logger.exception("the search of the map")
+            return
         if order is not None:
             logger.warning("the search: %s", order.why)
             self._navigator.give(order)
