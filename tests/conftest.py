@@ -1,5 +1,6 @@
 """Fixtures that several folders use."""
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -42,3 +43,17 @@ def xfeat_model(tmp_path_factory: pytest.TempPathFactory) -> Iterator[models.Sto
         with _skipped_where_unreachable("XFeat"):
             stored = models.ensure("xfeat")
     yield stored
+
+
+# As they were before any test; "" is the root.
+_LEVELS = {name: logging.getLogger(name).level for name in ("", "rasterio", "ortholoc_edge.bench.samples")}
+
+
+@pytest.fixture(autouse=True)
+def _levels_of_loggers_as_they_were() -> Iterator[None]:
+    """Commands set some for their whole process; here that goes on with other tests, which must still hear."""
+    for name, level in _LEVELS.items():
+        logging.getLogger(name).setLevel(level)
+    yield
+    for name, level in _LEVELS.items():
+        logging.getLogger(name).setLevel(level)
