@@ -101,6 +101,17 @@ def test_what_the_frame_path_does_not_come_to_is_withdrawn(desk: OperatorDesk, f
     assert [future.cancelled() for _, future in frames.left] == [True]
 
 
+def test_another_place_of_the_same_sender_does_not_get_the_answer_of_the_first(
+    desk: OperatorDesk, frames: Frames
+) -> None:
+    desk.take(heard(command_int(47.0)), 0)
+    desk.take(heard(command_int(47.5)), 1)
+    assert results(desk, 2) == [(255, 190, REJECTED)]
+    frames.left[0][1].set_result(True)
+    assert results(desk, 3) == [(255, 190, ACCEPTED)]
+    assert [place.lat_deg for place, _ in frames.left] == [47.0]
+
+
 def test_one_at_a_time_and_none_in_a_flood(desk: OperatorDesk, frames: Frames) -> None:
     desk.take(heard(command_int()), 0)
     desk.take(heard(command_int(), sender=(254, 190)), 1)

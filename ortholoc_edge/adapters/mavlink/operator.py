@@ -74,6 +74,7 @@ def place_of(m: MavlinkMessage) -> GivenPlace | None:
 @dataclass(frozen=True, slots=True)
 class _Waiting:
     sender: tuple[int, int]
+    place: GivenPlace
     since_ns: int
     taken: Future[bool]
 
@@ -91,15 +92,15 @@ class OperatorDesk:
 
     def take(self, m: MavlinkMessage, now_ns: int) -> None:
         """Take in a command that is addressed to us."""
-        sender = m.get_srcSystem(), m.get_srcComponent()
-        if self._waiting is not None and self._waiting.sender == sender:
-            # Sent again because the answer took too long; one is enough.
+        sender, place = (m.get_srcSystem(), m.get_srcComponent()), place_of(m)
+        if self._waiting is not None and (self._waiting.sender, self._waiting.place) == (sender, place):
+            # Sent again because the answer took too long; one is enough. Another place must not take that answer for
+            # its own.
             return
         paused = self._last_ns is not None and now_ns - self._last_ns < _PAUSE_NS
         if self.leave is None or self._waiting is not None or paused:
             self._answer(sender, dialect.MAV_RESULT_TEMPORARILY_REJECTED)
             return
-        place = place_of(m)
         if place is None:
             self._answer(sender, dialect.MAV_RESULT_DENIED)
             return
@@ -107,7 +108,7 @@ class OperatorDesk:
         if taken is None:
             self._answer(sender, dialect.MAV_RESULT_TEMPORARILY_REJECTED)
             return
-        self._last_ns, self._waiting = now_ns, _Waiting(sender, now_ns, taken)
+        self._last_ns, self._waiting = now_ns, _Waiting(sender, place, now_ns, taken)
 
     def poll(self, now_ns: int) -> list[MavlinkMessage]:
         """The answers that are due."""
