@@ -41,7 +41,7 @@ from ortholoc_edge.adapters.messages import Command, CommandReply, LadderMessage
 from ortholoc_edge.geometry import covariance as cov
 from ortholoc_edge.geometry import frames, rotation
 from ortholoc_edge.geometry.arrays import ImageArray
-from ortholoc_edge.pipeline.frame import Frame, VehicleState
+from ortholoc_edge.pipeline.frame import Frame, VehicleState, grey_of
 from ortholoc_edge.pipeline.navigator import Circumstances
 from ortholoc_edge.pipeline.outcome import Fix, Outcome
 from ortholoc_edge.pipeline.record import FrameRecord, frame_record, outcome_record
@@ -235,7 +235,7 @@ class FlightLog:
         try:
             if self._frames == "all":
                 # Every matcher begins so; the rest of a colour image tells a replay nothing.
-                return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
+                return grey_of(image)
             scale = min(1.0, _THUMBNAIL_PX / max(image.shape[:2]))
             return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
         except cv2.error:

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from ortholoc_edge.adapters.camera import BadFrameError, CameraOptions, EndOfFrames, open_source
@@ -16,7 +15,7 @@ from ortholoc_edge.calibration.lens import View
 from ortholoc_edge.clock import ManualClock
 from ortholoc_edge.errors import CameraError
 from ortholoc_edge.geometry.arrays import ImageArray
-from ortholoc_edge.pipeline.frame import Frame
+from ortholoc_edge.pipeline.frame import Frame, grey_of
 
 _S = 1_000_000_000
 # Edges of a sharp picture are 2 to 3 px wide, with the smoothing that they are measured with.
@@ -82,7 +81,7 @@ def look_for(frames: Iterable[Frame], board: Board, most: int) -> Looked:
     without: list[ImageArray] = []
     looked_at = 0
     for frame in frames:
-        grey = _grey(frame.image)
+        grey = grey_of(frame.image)
         here = grey.shape[1], grey.shape[0]
         if size is not None and here != size:
             raise CameraError(
@@ -114,10 +113,6 @@ def look_for(frames: Iterable[Frame], board: Board, most: int) -> Looked:
     kept = farthest(unlike, size, most)
     left_out["more than needed"] = len(unlike) - len(kept)
     return Looked(size, looked_at, tuple(kept), +left_out)
-
-
-def _grey(image: ImageArray) -> ImageArray:
-    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
 def _advice(board: Board, pictures: list[ImageArray]) -> str:

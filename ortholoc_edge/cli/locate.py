@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from ortholoc_edge.adapters.camera import read_image
@@ -28,7 +27,7 @@ from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
 from ortholoc_edge.geometry.camera import Camera
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.matching.types import Structural
-from ortholoc_edge.pipeline.frame import Frame
+from ortholoc_edge.pipeline.frame import Frame, grey_of
 from ortholoc_edge.pipeline.localizer import Localizer, LocalizerOptions
 from ortholoc_edge.pipeline.locate import Located, Searchers, locate
 from ortholoc_edge.pipeline.outcome import Fix
@@ -168,7 +167,7 @@ def _answer(
     west, south, east, north = searcher.field.grid.bounds
     turn = georeference.convergence_rad(np.array([(west + east) / 2, (south + north) / 2]))
     sighting = Sighting(
-        image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8),
+        grey_of(image),
         camera,
         frames.map_from_ned_rotation(turn) @ photo.ned_from_body @ frames.BODY_FROM_NADIR_CAMERA,
         reach_rad,

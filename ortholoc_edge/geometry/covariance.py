@@ -108,6 +108,11 @@ def rotated(covariance: FloatArray, rotation: npt.ArrayLike) -> FloatArray:
     return block @ covariance @ block.T
 
 
+def horizontal_sigma(covariance: FloatArray) -> float:
+    """1-sigma along the worst horizontal direction, of a covariance (n, n) whose first two are east and north."""
+    return float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
+
+
 # Standard deviations to a protection level: RTCA DO-229, appendix J, precision approach.
 _HORIZONTAL_SIGMAS, _VERTICAL_SIGMAS = 6.0, 5.33
 
@@ -118,8 +123,7 @@ def protection_levels(covariance: FloatArray) -> tuple[float, float]:
 
     They bound the error of a pose at the right place; that it is at the right place is what the gate is for.
     """
-    worst = float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
-    return _HORIZONTAL_SIGMAS * float(np.sqrt(worst)), _VERTICAL_SIGMAS * float(np.sqrt(covariance[2, 2]))
+    return _HORIZONTAL_SIGMAS * horizontal_sigma(covariance), _VERTICAL_SIGMAS * float(np.sqrt(covariance[2, 2]))
 
 
 def mahalanobis_squared(difference: npt.ArrayLike, covariance: npt.ArrayLike) -> float:

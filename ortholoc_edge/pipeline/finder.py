@@ -21,7 +21,7 @@ from ortholoc_edge.geometry import covariance as cov
 from ortholoc_edge.geometry import frames
 from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
 from ortholoc_edge.geometry.camera import Camera
-from ortholoc_edge.pipeline.frame import CameraMount, Frame, VehicleState
+from ortholoc_edge.pipeline.frame import CameraMount, Frame, VehicleState, grey_of
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.search import Candidate, Former, Sighting, circle
 from ortholoc_edge.pipeline.tracker import (
@@ -30,6 +30,7 @@ from ortholoc_edge.pipeline.tracker import (
     FoundPosition,
     Tracker,
     TrackerOptions,
+    anchor_at,
     carried,
     moved_map_m,
 )
@@ -191,8 +192,8 @@ class Finder:
         self._asked: _Asked | None = None
         # Of the next check of a track; and of any search after one that could not be made.
         self._due_ns = self._retry_ns = 0
-        self._last_fix_ns: int | None = None
-        self._began_ns: int | None = None
+        # Since when nothing has said where the vehicle is; None before the first frame.
+        self._lost_since_ns: int | None = None
         self._hypothesis: _Hypothesis | None = None
         self._corners: FloatArray | None = None
         self._demanded = False
@@ -214,7 +215,7 @@ class Finder:
         """Search at once, whatever GNSS and the track say, only inside this polygon (N, 2) of map coordinates until it
         is found there; None: everywhere."""
         self._corners, self._hypothesis, self._retry_ns, self._demanded = corners_map, None, now_ns, True
-        self._former, self._last_fix_ns, self._began_ns = [], None, 0
+        self._former, self._lost_since_ns = [], 0
         # What is under way looks elsewhere.
         self._asked = None
 
@@ -225,7 +226,7 @@ class Finder:
 
     def is_lost(self, now_ns: int) -> bool:
         """Whether there was no fix for long."""
-        since_ns = self._last_fix_ns if self._last_fix_ns is not None else self._began_ns
+        since_ns = self._lost_since_ns
         return since_ns is not None and now_ns - since_ns > self._options.lost_after_s * _S
 
     def step(self, frame: Frame, state: VehicleState, outcome: Outcome, now_ns: int) -> FoundPosition | None:
@@ -236,13 +237,13 @@ class Finder:
             now_ns: of the clock of the stamps.
         Returns: for the tracker, where the search has won.
         """
-        if self._began_ns is None:
-            self._began_ns = now_ns
+        if self._lost_since_ns is None:
+            self._lost_since_ns = now_ns
         if isinstance(outcome, Fix):
-            self._last_fix_ns, self._lost_told = now_ns, False
+            self._lost_since_ns, self._lost_told = now_ns, False
         if self._gnss_tells(state) and not self._demanded:
             # It says where the vehicle is: there is nothing to be found, and what was found meanwhile is not needed.
-            self._hypothesis, self._last_fix_ns, self.says, self._asked = None, now_ns, "", None
+            self._hypothesis, self._lost_since_ns, self.says, self._asked = None, now_ns, "", None
             self._seeker.take()
             return None
         order = self._hear(now_ns)
@@ -271,7 +272,7 @@ class Finder:
         lever = map_from_body @ mount.body_from_camera.translation
         sigma_rad = math.hypot(state.attitude_sigma_rad[2], mount.sigma_rad[1])
         sighting = Sighting(
-            _grey(frame.image, self._camera),
+            _of_size(frame.image, self._camera),
             self._camera,
             map_from_body @ mount.body_from_camera.rotation,
             min(max(_HEADING_SIGMAS * sigma_rad, _LEAST_HEADING_RAD), math.pi),
@@ -310,8 +311,8 @@ class Finder:
         if anchor is None or self._searches % _EVERYWHERE == _EVERYWHERE - 1:
             return None
         elapsed_s = max(now_ns - anchor.stamp_ns, 0) / _S
-        reach_m = _AREA_M + _AREA_SIGMAS * _sigma_m(anchor.covariance) + self._options.max_speed_m_per_s * elapsed_s
-        return circle(anchor.position_map_m[:2], reach_m)
+        off_m = _AREA_M + _AREA_SIGMAS * cov.horizontal_sigma(anchor.covariance)
+        return circle(anchor.position_map_m[:2], off_m + self._options.max_speed_m_per_s * elapsed_s)
 
     def _helpful(self, state: VehicleState) -> tuple[Former, ...]:
         """Earlier frames, where it is known how the vehicle has moved since."""
@@ -343,10 +344,8 @@ class Finder:
                 self._trouble_told = True
                 self._notices.append("OrthoLoC: the map can't be searched, see log")
             return None
-        here = Anchor(
-            asked.state.stamp_ns, np.append(self._about(), 0.0), np.zeros((3, 3)), np.zeros((3, 3)),
-            asked.state.odometry_ned_m, asked.state.odometry_epoch, firm=False,
-        )  # fmt: skip
+        unknown = np.zeros((3, 3))
+        here = anchor_at(asked.state, np.append(self._about(), 0.0), unknown, unknown, firm=False)
         self._former = [*self._former, (here, answer.own)][-_FORMER:]
         if isinstance(answer.outcome, Rejected):
             self.says = f"not found: {answer.outcome.reason.value}"
@@ -358,10 +357,7 @@ class Finder:
         map_from_body = fix.map_from_camera @ asked.mount.body_from_camera.inverse()
         moved = cov.of_moved_point(fix.covariance, map_from_body.translation - fix.map_from_camera.translation)
         state, position, covariance = asked.state, map_from_body.translation, moved[:3, :3]
-        place = Anchor(
-            state.stamp_ns, position, covariance, covariance, state.odometry_ned_m, state.odometry_epoch, firm=True,
-            drift_m_per_s=LOST_DRIFT_M_PER_S,
-        )  # fmt: skip
+        place = anchor_at(state, position, covariance, covariance, firm=True, drift_m_per_s=LOST_DRIFT_M_PER_S)
         anchor = self._tracker.anchor
         if not lost and anchor is not None and self._same(anchor, place, state):
             self._hypothesis, self._corners, self._demanded = None, None, False
@@ -385,7 +381,7 @@ class Finder:
     def _same(self, anchor: Anchor, place: Anchor, state: VehicleState) -> bool:
         """Whether an anchor, carried to where a frame was found, is there."""
         _, covariance = carried(anchor, state, self._tracker_options, self._georeference)
-        limit_m = _SAME_M + _SAME_SIGMAS * _sigma_m(covariance + place.covariance)
+        limit_m = _SAME_M + _SAME_SIGMAS * cov.horizontal_sigma(covariance + place.covariance)
         return limit_m <= _SAYS_NOTHING_M and self._away_m(anchor, place, state) <= limit_m
 
     def _away_m(self, anchor: Anchor, place: Anchor, state: VehicleState) -> float:
@@ -410,17 +406,13 @@ def _order(place: Anchor, why: str) -> FoundPosition:
     )
 
 
-def _grey(image: ImageArray, camera: Camera) -> ImageArray:
-    grey = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+def _of_size(image: ImageArray, camera: Camera) -> ImageArray:
+    """In grey, as large as the camera's pictures are."""
+    grey = grey_of(image)
     if grey.shape == (camera.height, camera.width):
         return grey
     size = camera.width, camera.height
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-
-
-def _sigma_m(covariance: FloatArray) -> float:
-    """Along the worst horizontal direction."""
-    return float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
 
 
 def _told(away_m: float) -> str:

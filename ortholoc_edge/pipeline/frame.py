@@ -4,11 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
+import numpy as np
+
 from ortholoc_edge.geometry.arrays import FloatArray, ImageArray
 from ortholoc_edge.geometry.rigid import Rigid3
 
 # Of `VehicleState.turns_before`: as far back as stamps of cameras are late, and as finely as attitudes come.
 TURN_AGES_NS = tuple(20_000_000 * step for step in range(1, 13))
+
+
+def grey_of(image: ImageArray) -> ImageArray:
+    """(H, W) uint8 of a picture (H, W) or (H, W, 3) RGB, uint8."""
+    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,7 +9,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
-import cv2
 import numpy as np
 from msgspec import Meta, Struct, field, structs
 
@@ -29,7 +28,7 @@ from ortholoc_edge.matching.types import (
     UnscaledMatcher,
 )
 from ortholoc_edge.pipeline import gate, precondition, structural, surface
-from ortholoc_edge.pipeline.frame import Frame
+from ortholoc_edge.pipeline.frame import Frame, grey_of
 from ortholoc_edge.pipeline.outcome import Fix, Outcome, Reason, Rejected
 from ortholoc_edge.pipeline.precondition import ReferenceView
 from ortholoc_edge.pipeline.prior import (
@@ -510,9 +509,7 @@ class Localizer:
                 f"{frame.name}: {shape[:2]} {frame.image.dtype}, but the camera's intrinsics are for "
                 f"{camera.width} x {camera.height} px of 8 bit",
             )
-        if frame.image.ndim == 2:
-            return frame.image
-        return np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+        return grey_of(frame.image)
 
     def _query_features(self, matcher: Matcher, grey: ImageArray, trace: Trace) -> Features:
         with trace.stage("query_features"):

@@ -58,7 +58,7 @@ class LocateOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     ``near_best``: part of the best one's score, below which a candidate is not.
     ``min_support``: `Fix.quality`, below which a fix counts for nothing. The gate's own limit is for the one place that
         a prior means; of many places in which the search found likeness some pass it. Of 150 hostile frames five did,
-        with 0.127 at most; the least of 128 right ones is 0.308 (docs/studies/search.md).
+        with 0.127 at most; the least of 384 right ones is 0.21 (docs/studies/search.md).
     ``min_lead``: score of the place that is right over that of the best other one, at least.
     ``sure_lead``: where the best one has that much over the next and is right, no other is looked at.
     """

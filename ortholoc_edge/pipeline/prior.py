@@ -9,7 +9,7 @@ import numpy as np
 from ortholoc_edge.geometry import rotation
 from ortholoc_edge.geometry.arrays import FloatArray, frozen_floats
 from ortholoc_edge.geometry.camera import Camera
-from ortholoc_edge.geometry.covariance import mahalanobis_squared
+from ortholoc_edge.geometry.covariance import horizontal_sigma, mahalanobis_squared
 from ortholoc_edge.geometry.rigid import Rigid3
 from ortholoc_edge.tiles.lattice import Bounds
 
@@ -52,7 +52,7 @@ class PosePrior:
     @property
     def position_sigma_m(self) -> float:
         """Along the worst horizontal direction."""
-        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:2, :2])[-1]))
+        return horizontal_sigma(self.covariance)
 
     @property
     def height_sigma_m(self) -> float:

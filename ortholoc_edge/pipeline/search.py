@@ -205,7 +205,7 @@ class Searcher:
 
     def _everywhere(self, sighting: Sighting, scale: _Scale, within: FloatArray | None) -> list[Candidate]:
         found: list[Candidate] = []
-        turns = _turns(sighting.heading_reach_rad, scale.turn_rad)
+        turns = _turns(sighting.heading_reach_rad, scale.halving * _TURN_RAD)
         zooms = _zooms(sighting.height_reach)
         tasks = list(_tasks(sighting, scale, within))
         heights = sorted({above_m for _, tries in tasks for above_m, _ in tries})
@@ -232,6 +232,7 @@ class _Near:
 
     def __init__(self, sighting: Sighting, field: CoarseField, within: FloatArray | None) -> None:
         self._sighting, self._field, self._within = sighting, field, within
+        self._highest_m = _highest_m(sighting, field)
         # Many places have the same heading and height. Made twice, where threads want one at once, they are the same.
         self._made: dict[tuple[float, float], _Template | None] = {}
 
@@ -246,8 +247,7 @@ class _Near:
                 steps = round(math.log(self._sighting.height_m - ground_m) / math.log(_FINE_ZOOM))
                 above_m = _FINE_ZOOM**steps
         needed_px = side + 2 * _margin_px(replace(self._sighting, above_ground_m=above_m), field, 1)
-        highest_m = _highest_m(self._sighting, field)
-        scale = _Scale(field, 1, _TURN_RAD, 2 * cv2.getOptimalDFTSize(-(-needed_px // 2)), highest_m)
+        scale = _Scale(field, 1, 2 * cv2.getOptimalDFTSize(-(-needed_px // 2)), self._highest_m)
         turns = (place.turn_rad - _TURN_RAD, place.turn_rad, place.turn_rad + _TURN_RAD)
         tried = [self._template(scale, above_m, turn_rad) for turn_rad in turns]
         templates = [template for template in tried if template is not None]
@@ -263,12 +263,11 @@ class _Near:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scale:
-    """A pass over the map: its field, by how much coarser than what frames are rectified for, the step of the heading,
-    the side of the blocks, and the highest that the camera can be above ground."""
+    """A pass over the map: its field, by how much coarser than what frames are rectified for, the side of the blocks,
+    and the highest that the camera can be above ground."""
 
     field: CoarseField
     halving: int
-    turn_rad: float
     block_px: int
     highest_m: float
 
@@ -277,7 +276,7 @@ def _scale(sighting: Sighting, field: CoarseField, halving: int) -> _Scale:
     """With blocks of which a third or more is their inside."""
     margin_px = _margin_px(sighting, field, halving)
     block_px = max(_BLOCK_PX // halving, 2 * cv2.getOptimalDFTSize(-(-3 * margin_px // 2)))
-    return _Scale(field, halving, halving * _TURN_RAD, block_px, _highest_m(sighting, field))
+    return _Scale(field, halving, block_px, _highest_m(sighting, field))
 
 
 def circle(middle: FloatArray, radius_m: float) -> FloatArray:
@@ -387,9 +386,7 @@ def _tasks(
 
 def _steps(sighting: Sighting, field: CoarseField, block: _Block) -> Iterator[tuple[float, _Band]]:
     """Heights above ground that a block's ground asks for, each with the ground that it is right for."""
-    place = field.grid.crop(block.column, block.row, block.side, block.side)
-    around = np.stack(np.meshgrid(np.arange(0, block.side, 8), np.arange(0, block.side, 8)), axis=-1).reshape(-1, 2)
-    ground = field.ground_m(place.map_from_px(around))
+    ground = _lattice(field, block)
     above = sighting.height_m - ground[np.isfinite(ground)]
     steps = np.unique(np.round(np.log(above[above > 1.0]) / math.log(_ZOOM)).astype(int))
     for step in steps.tolist():
@@ -465,11 +462,16 @@ def _fit(spectra: Sequence[np.ndarray], template: _Template, margin: int, side: 
 
 def _ground(field: CoarseField, block: _Block) -> FloatArray:
     """(side, side) heights of the ground below, every eighth pixel's for those after it."""
-    place = field.grid.crop(block.column, block.row, block.side, block.side)
-    coarse = np.arange(0.0, block.side + 8.0, 8.0)
-    ground = field.ground_m(place.map_from_px(np.stack(np.meshgrid(coarse, coarse), axis=-1).reshape(-1, 2)))
-    wide = np.repeat(np.repeat(ground.reshape(len(coarse), -1), 8, axis=0), 8, axis=1)
+    wide = np.repeat(np.repeat(_lattice(field, block), 8, axis=0), 8, axis=1)
     return np.asarray(wide[: block.side, : block.side])
+
+
+def _lattice(field: CoarseField, block: _Block) -> FloatArray:
+    """(k, k) heights of the ground below every eighth pixel."""
+    place = field.grid.crop(block.column, block.row, block.side, block.side)
+    coarse = np.arange(0.0, block.side, 8.0)
+    ground = field.ground_m(place.map_from_px(np.stack(np.meshgrid(coarse, coarse), axis=-1).reshape(-1, 2)))
+    return np.asarray(ground.reshape(len(coarse), -1))
 
 
 def _inside(field: CoarseField, block: _Block) -> BoolArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated
 
@@ -216,23 +216,23 @@ class Tracker:
                 Reason.GIMBAL_UNKNOWN,
                 "no attitude of the gimbal near the exposure; is it on, and does [mount] name the right one?",
             )
-        carried = self._carried(state)
-        if carried is None or _sigma(carried[1]) > self._options.lost_sigma_m or self._contested(carried, state):
+        known, lost_m = self._carried(state), self._options.lost_sigma_m
+        if known is None or cov.horizontal_sigma(known[1]) > lost_m or self._contested(known, state):
             believed = self._believed(state)
             if believed is not None:
                 # The chain of fixes is broken: the next one is a new start, and the autopilot must hear of it as one.
-                carried, self.status = believed, TrackerStatus.SEARCH
+                known, self.status = believed, TrackerStatus.SEARCH
                 self._predicted_elsewhere = True
-        if carried is None:
+        if known is None:
             return Rejected(state.stamp_ns, Reason.NO_PRIOR, "no fix yet and no position from the autopilot")
-        position, position_covariance = carried
-        if _sigma(position_covariance) > self._options.lost_sigma_m:
+        position, position_covariance = known
+        if cov.horizontal_sigma(position_covariance) > lost_m:
             return Rejected(
                 state.stamp_ns,
                 Reason.NO_PRIOR,
                 "the last known position is too old to predict from; horizontal 1-sigma, m",
-                _sigma(position_covariance),
-                self._options.lost_sigma_m,
+                cov.horizontal_sigma(position_covariance),
+                lost_m,
             )
         map_from_ned = frames.map_from_ned_rotation(self._georeference.convergence_rad(position[:2]))
         body = Rigid3(map_from_ned @ attitude, position)
@@ -267,8 +267,9 @@ class Tracker:
         covariance = cov.of_moved_point(outcome.covariance, lever)
         settled = covariance if ground is None else cov.of_moved_point(outcome.covariance - ground, lever)
         drift_m_per_s = self._drift_seen(state, body.translation, covariance[:3, :3])
-        anchor = anchor_at(state, body.translation, covariance[:3, :3], settled[:3, :3], firm=True)
-        self.anchor = replace(anchor, drift_m_per_s=drift_m_per_s)
+        self.anchor = anchor_at(
+            state, body.translation, covariance[:3, :3], settled[:3, :3], firm=True, drift_m_per_s=drift_m_per_s
+        )
         if state.position_map_m is not None:
             both = settled[:2, :2] + np.eye(2) * state.position_sigma_m[0] ** 2
             self.witness.compare(state.stamp_ns, state.position_map_m - body.translation, both)
@@ -277,7 +278,7 @@ class Tracker:
     def _drift_seen(self, state: VehicleState, position: FloatArray, covariance: FloatArray) -> float:
         """What the odometry may err after a fix, see `Anchor`, by what it did before it."""
         anchor, least = self.anchor, self._options.odometry_drift_m_per_s
-        # Of a place that somebody gave, or GNSS, the fix says more than of the odometry since.
+        # Of GNSS, or where the autopilot believed to be, the fix says more than of the odometry since.
         if anchor is None or not anchor.firm or self._predicted_elsewhere:
             return 0.0
         there, spread = carried(anchor, state, self._options, self._georeference)
@@ -310,7 +311,7 @@ class Tracker:
             return None
         return believed, _axes(*self._options.believed_sigma_m)
 
-    def _contested(self, carried: tuple[FloatArray, FloatArray], state: VehicleState) -> bool:
+    def _contested(self, known: tuple[FloatArray, FloatArray], state: VehicleState) -> bool:
         """Whether it is the turn of the autopilot's own position against a GNSS that it contradicts.
 
         Before the first fix nothing tells which is right: the autopilot may have flown by our fixes of an earlier life
@@ -319,7 +320,7 @@ class Tracker:
         believed = self._believed(state)
         if believed is None or self.anchor is None or self.anchor.firm:
             return False
-        apart = cov.mahalanobis_squared((believed[0] - carried[0])[:2], (believed[1] + carried[1])[:2, :2])
+        apart = cov.mahalanobis_squared((believed[0] - known[0])[:2], (believed[1] + known[1])[:2, :2])
         if apart <= _CONTRADICTION_SIGMAS**2:
             return False
         self._gnss_turn = not self._gnss_turn
@@ -354,12 +355,12 @@ class Tracker:
         if position is None or not (np.isfinite(position).all() and np.isfinite(sigma_m).all()):
             return
         covariance = _axes(*sigma_m)
-        carried = self._carried(state)
-        if carried is not None and self.anchor is not None:
-            settled = carried[1] - self.anchor.covariance + self.anchor.settled
-            if _sigma(settled) <= _sigma(covariance):
+        known = self._carried(state)
+        if known is not None and self.anchor is not None:
+            settled = known[1] - self.anchor.covariance + self.anchor.settled
+            if cov.horizontal_sigma(settled) <= cov.horizontal_sigma(covariance):
                 return
-            apart = cov.mahalanobis_squared(position - carried[0], covariance + settled)
+            apart = cov.mahalanobis_squared(position - known[0], covariance + settled)
             if self.anchor.firm and apart > _CONTRADICTION_SIGMAS**2:
                 return
         self.anchor = anchor_at(state, position, covariance, covariance, firm=False)
@@ -402,13 +403,20 @@ def moved_map_m(anchor: Anchor, state: VehicleState, georeference: Georeference)
 
 
 def anchor_at(
-    state: VehicleState, position: FloatArray, covariance: FloatArray, settled: FloatArray, firm: bool
+    state: VehicleState,
+    position: FloatArray,
+    covariance: FloatArray,
+    settled: FloatArray,
+    firm: bool,
+    drift_m_per_s: float = 0.0,
 ) -> Anchor:
+    """A place (3,) at a state's stamp, with what its odometry said then; arguments as of `Anchor`."""
     odometry = state.odometry_ned_m
     usable = odometry is not None and bool(np.isfinite(odometry).all())
     return Anchor(
-        state.stamp_ns, position, covariance, settled, odometry if usable else None, state.odometry_epoch, firm
-    )
+        state.stamp_ns, position, covariance, settled, odometry if usable else None, state.odometry_epoch, firm,
+        drift_m_per_s,
+    )  # fmt: skip
 
 
 def _wandered_s(elapsed_s: float, memory_s: float) -> float:
@@ -423,8 +431,3 @@ def _wandered_s(elapsed_s: float, memory_s: float) -> float:
 def _axes(horizontal_m: float, vertical_m: float) -> FloatArray:
     """(3, 3) of 1-sigmas."""
     return np.diag(np.square([horizontal_m, horizontal_m, vertical_m]))
-
-
-def _sigma(covariance: FloatArray) -> float:
-    """Along the worst horizontal direction, m."""
-    return float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]))

@@ -83,8 +83,7 @@ def test_implausible_heights_are_holes_and_are_told(tmp_path, caplog, kind):
         values["dsm"][(*at, 2)] = median + above
     if kind == "heights":
         values["dsm"] = values["dsm"][..., 2]
-    # By its name: the command `bench` makes it quiet, and in one process tests follow each other.
-    with caplog.at_level("WARNING", logger="ortholoc_edge.bench.samples"):
+    with caplog.at_level("WARNING"):
         dsm = samples.read_sample(written(tmp_path, values)).dsm
     assert {tuple(at) for at in np.argwhere(np.isnan(dsm))} == {*gone, (9, 9)}
     assert "S0: 3 of 191 heights" in caplog.text
@@ -94,8 +93,7 @@ def test_the_delivered_sample_with_spikes_makes_a_pack(caplog):
     path = REAL / "seneca" / "samples" / "SENECA_R0000.npz"
     if not path.is_file():
         pytest.skip(f"{path} is not there: the real samples lie outside the repository")
-    with caplog.at_level("WARNING", logger="ortholoc_edge.bench.samples"):
-        sample = samples.read_sample(path)
+    sample = samples.read_sample(path)
     assert "SENECA_R0000: 275 of" in caplog.text
     with sample_store(sample) as store:
         assert store.ground_near(sample.map_from_camera.translation[:2]) is not None
